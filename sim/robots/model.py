@@ -30,13 +30,24 @@ def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
 
 def make_builder(model: Any) -> newton.ModelBuilder:
     """A compiled robot of :func:`sim.robots.compiled.robot_spec` as a Newton builder."""
+    solver = newton.solvers.SolverMuJoCo
     builder = newton.ModelBuilder(gravity=wp.vec3(*map(float, model.opt.gravity)))
-    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    solver.register_custom_attributes(builder)
     builder.rigid_gap = 0.0  # the default of 0.1 m triples the contacts
     joints = [_add_body(builder, model, body) for body in range(1, model.nbody)]
     builder.add_articulation(joints)
     for actuator in range(model.nu):
-        _set_drive(builder, model, actuator)
+        dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
+        builder.joint_target_ke[dof] = float(model.actuator_gainprm[actuator, 0])
+        builder.joint_target_kd[dof] = float(-model.actuator_biasprm[actuator, 2])
+        builder.joint_target_mode[dof] = int(newton.JointTargetMode.POSITION)
+        row: dict[str, Any] = {"ctrl_source": solver.CtrlSource.JOINT_TARGET, "ctrl_type": solver.CtrlType.POSITION}
+        for name in ("ctrl", "force"):
+            limited = bool(getattr(model, f"actuator_{name}limited")[actuator])
+            row[f"actuator_{name}limited"] = row[f"actuator_has_{name}range"] = int(limited)
+            row[f"actuator_{name}range"] = _vec2(*getattr(model, f"actuator_{name}range")[actuator])
+        row["actuator_trnid"] = wp.vec2i(dof, 0)
+        builder.add_custom_values(**{f"mujoco:{name}": value for name, value in row.items()})
     for k in range(model.neq):
         follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
         builder.set_joint_mimic(joints[follower], joints[leader], coeffs=_vec2(*model.eq_data[k, :2]))
@@ -100,24 +111,6 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
 
 def _vector(values: NDArray[np.float64]) -> Any:
     return wp.types.vector(length=len(values), dtype=wp.float32)(*map(float, values))
-
-
-def _set_drive(builder: newton.ModelBuilder, model: Any, actuator: int) -> None:
-    """Gives a joint its gains, and a row of Newton's with the actuator's ranges."""
-    dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
-    builder.joint_target_ke[dof] = float(model.actuator_gainprm[actuator, 0])
-    builder.joint_target_kd[dof] = float(-model.actuator_biasprm[actuator, 2])
-    builder.joint_target_mode[dof] = int(newton.JointTargetMode.POSITION)
-    row: dict[str, Any] = {
-        "ctrl_source": newton.solvers.SolverMuJoCo.CtrlSource.JOINT_TARGET,
-        "ctrl_type": newton.solvers.SolverMuJoCo.CtrlType.POSITION,
-        "actuator_trnid": wp.vec2i(dof, 0),
-    }
-    for name in ("ctrl", "force"):
-        limited = bool(getattr(model, f"actuator_{name}limited")[actuator])
-        row[f"actuator_{name}limited"] = row[f"actuator_has_{name}range"] = int(limited)
-        row[f"actuator_{name}range"] = _vec2(*getattr(model, f"actuator_{name}range")[actuator])
-    builder.add_custom_values(**{f"mujoco:{name}": value for name, value in row.items()})
 
 
 def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:

@@ -50,18 +50,6 @@ _GROWTH = 1.25
 _Array = NDArray[np.float64]
 
 
-def _surface_samples(triangles: _Array, spacing: float) -> _Array:
-    """Points on the triangles, corners included: none of a triangle is farther than spacing / sqrt(3) from the next."""
-    samples = []
-    for a, b, c in triangles:
-        longest = max(np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c))
-        count = max(1, int(np.ceil(longest / spacing)))
-        steps = np.arange(count + 1)
-        u, v = np.argwhere(steps[:, None] + steps <= count).T[..., None] / count
-        samples.append(a + u * (b - a) + v * (c - a))
-    return np.unique(np.round(np.concatenate(samples), 7), axis=0).astype(np.float64)
-
-
 def _inscribe_ball(point: _Array, planes: _Array, radii: _Array, max_depth: float) -> tuple[_Array, float]:
     """Centre and radius of the first of the falling ``radii`` whose inscribed ball is so near to a surface point."""
     normal = planes[:, :3]
@@ -82,7 +70,14 @@ def _inscribe_ball(point: _Array, planes: _Array, radii: _Array, max_depth: floa
 def _cover(triangles: _Array, planes: _Array, inradius: float, tolerance: float) -> tuple[_Array, _Array] | None:
     """Balls, (n, 3) and (n,), with every sample of the surface near enough to one; None if it takes too many."""
     spacing = tolerance / _SAMPLES_PER_TOLERANCE
-    samples = _surface_samples(triangles, spacing)
+    points = []  # of each triangle, none farther than spacing / sqrt(3) from the next, corners included
+    for a, b, c in triangles:
+        longest = max(np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c))
+        count = max(1, int(np.ceil(longest / spacing)))
+        steps = np.arange(count + 1)
+        u, v = np.argwhere(steps[:, None] + steps <= count).T[..., None] / count
+        points.append(a + u * (b - a) + v * (c - a))
+    samples = np.unique(np.round(np.concatenate(points), 7), axis=0).astype(np.float64)
     goal = tolerance - spacing / np.sqrt(3.0)
     largest = min(inradius, _MAX_PROBE_RADIUS)
     radii = largest * 0.5 ** np.arange(max(1.0, np.ceil(np.log2(8.0 * largest / tolerance))))

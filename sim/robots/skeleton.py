@@ -46,8 +46,20 @@ def shown_spec(robot: RobotCfg) -> Any:
         for k in range(look.ngeom):
             shape = {name: getattr(look, f"geom_{name}")[k] for name in ("type", "size", "pos", "quat", "rgba")}
             looks[look.body(look.geom_bodyid[k]).name].append(shape)
-    for body in spec.bodies[1:]:
-        _dress(body, looks.pop(body.name, []), robot)
+    for body in spec.bodies[1:]:  # hides what others replace, and colours by role what has no colour
+        shapes = looks.pop(body.name, [])
+        touching = touching_geoms(body)
+        visual = [geom for geom in body.geoms if geom not in touching and geom.group < _HIDDEN]
+        for geom in visual:
+            geom.group = _HIDDEN if shapes else _VISUAL
+        for shape in shapes:
+            body.add_geom(group=_VISUAL, mass=0.0, contype=0, conaffinity=0, **shape)
+        for geom in touching:
+            is_foot = geom.name in robot.foot_geoms
+            geom.group = _HIDDEN if (visual or shapes) and not is_foot else _BARE
+            if not geom.material and tuple(geom.rgba) == _NO_COLOR:
+                is_base = geom.name in robot.base_geoms
+                geom.rgba = _FOOT_COLOR if is_foot else _BASE_COLOR if is_base else _LIMB_COLOR
     if looks:
         names = ", ".join(body.name for body in spec.bodies[1:])
         raise ValueError(f"{look_file} has a body '{next(iter(looks))}': expected those of {robot.model_file}, {names}")
@@ -89,21 +101,6 @@ def _compiled(compile_model: Callable[[], Any], file: Path) -> Any:
         return compile_model()
     except Exception as error:  # MuJoCo's own type has no name
         raise ValueError(f"{file} cannot be shown: {' '.join(str(error).split())}") from None
-
-
-def _dress(body: Any, look: list[dict[str, Any]], robot: RobotCfg) -> None:
-    """Hides shapes of a body that others replace, and colours those without a colour by their role."""
-    touching = touching_geoms(body)
-    visual = [geom for geom in body.geoms if geom not in touching and geom.group < _HIDDEN]
-    for geom in visual:
-        geom.group = _HIDDEN if look else _VISUAL
-    for shape in look:
-        body.add_geom(group=_VISUAL, mass=0.0, contype=0, conaffinity=0, **shape)
-    for geom in touching:
-        is_foot = geom.name in robot.foot_geoms
-        geom.group = _HIDDEN if (visual or look) and not is_foot else _BARE
-        if not geom.material and tuple(geom.rgba) == _NO_COLOR:
-            geom.rgba = _FOOT_COLOR if is_foot else _BASE_COLOR if geom.name in robot.base_geoms else _LIMB_COLOR
 
 
 class Skeleton:

@@ -113,7 +113,16 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     pose = given.get("default_joint_pos", robot_file.home or nearest)
     if len(pose) != model.njnt - 1 or not all(isinstance(q, int | float) and math.isfinite(q) for q in pose):
         raise ValueError(f"{file}: default_joint_pos must be {model.njnt - 1} angles [rad], got {pose}")
-    roles = _infer_roles(given, model, pose)
+    ((bottoms, _),) = measure_extents(make_builder(model), [pose])
+    body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
+    last_bodies = {*range(2, model.nbody)} - {*map(int, model.body_parentid)}
+    roles = {role: given[role] for role in _ROLES if role in given}  # geoms of those have no other
+    low = [name for name, bottom in bottoms.items() if bottom <= min(bottoms.values()) + _FOOT_RISE]
+    free = [name for name in bottoms if not any(name in names for names in roles.values())]
+    roles.setdefault("base_geoms", [name for name in free if body[name] == 1])
+    roles.setdefault("foot_geoms", [name for name in free if name in low and body[name] in last_bodies])
+    with_role = {*roles["base_geoms"], *roles["foot_geoms"]}
+    roles.setdefault("limb_geoms", [name for name in free if name not in with_role])
     data = mj.MjData(model)
     data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *pose]
     mj.mj_kinematics(model, data)
@@ -135,21 +144,6 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
         "scan_y": scan.get("y", []),
     }
     return inferred | roles | given
-
-
-def _infer_roles(given: dict[str, Any], model: Any, pose: Sequence[float]) -> dict[str, list[str]]:
-    """Geoms of each role; those whose role is given have no other."""
-    ((bottoms, _),) = measure_extents(make_builder(model), [pose])
-    body = {model.geom(k).name: int(model.geom_bodyid[k]) for k in np.flatnonzero(model.geom_contype)}
-    last_bodies = {*range(2, model.nbody)} - {*map(int, model.body_parentid)}
-    roles = {role: given[role] for role in _ROLES if role in given}
-    low = [name for name, bottom in bottoms.items() if bottom <= min(bottoms.values()) + _FOOT_RISE]
-    free = [name for name in bottoms if not any(name in names for names in roles.values())]
-    roles.setdefault("base_geoms", [name for name in free if body[name] == 1])
-    roles.setdefault("foot_geoms", [name for name in free if name in low and body[name] in last_bodies])
-    with_role = {*roles["base_geoms"], *roles["foot_geoms"]}
-    roles.setdefault("limb_geoms", [name for name in free if name not in with_role])
-    return roles
 
 
 def describe_inferred(robot: RobotCfg) -> str:
