@@ -26,7 +26,7 @@ class GroundMaps:
     friction: NDArray[np.float32]
     """Factor of the friction that contacts have on other ground, 0.15 to 1, shape (T, 4, 8), row along y."""
     time_constant_s: NDArray[np.float32]
-    """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, likewise."""
+    """Contact time constant [s], 0.01 to 0.06, or 0 of firm ground, of the same shape."""
     conditions: NDArray[np.float32] | None = None
     """Conditions (:mod:`sim.terrains.conditions`), shape (T, number of values); nominal ones if None."""
 
