@@ -109,18 +109,14 @@ class CommandTask:
     def _build_simulation(self, terrain_of_env: np.ndarray, rng: np.random.Generator) -> Simulation:
         tiles = self.tiles
         ground = tiles.ground
+        with_conditions = ground is not None and ground.conditions is not None
         bank = TerrainBank(
-            len(tiles.heights), device=self.device, with_ground=ground is not None,
-            with_conditions=ground is not None and ground.conditions is not None,
-        )  # fmt: skip
-        bank.set_heights(tiles.heights, ground=tiles.ground)
-        return Simulation(
-            self.robot,
-            bank,
-            terrain_of_env,
-            friction=rng.uniform(*self.cfg.friction, self.num_envs).astype(np.float32),
-            added_base_mass=rng.uniform(*self.cfg.added_base_mass, self.num_envs).astype(np.float32),
+            len(tiles.heights), device=self.device, with_ground=ground is not None, with_conditions=with_conditions
         )
+        bank.set_heights(tiles.heights, ground=ground)
+        friction = rng.uniform(*self.cfg.friction, self.num_envs).astype(np.float32)
+        mass = rng.uniform(*self.cfg.added_base_mass, self.num_envs).astype(np.float32)
+        return Simulation(self.robot, bank, terrain_of_env, friction=friction, added_base_mass=mass)
 
     def step(self, action: torch.Tensor) -> None:
         """Make one control step with actions (num_envs, num_joints); an episode that ends restarts within it."""
@@ -215,13 +211,9 @@ def _make_task(cfg: TaskCfg, robot: RobotCfg) -> Any:
     if not cfg.crosses:
         endless = {"lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
         _fill(task, yaw_gain=cfg.yaw_gain, max_yaw_rate=cfg.max_yaw_rate, **endless)
-    return _fill(
-        task,
-        max_steps=round(cfg.episode_s / robot.control_dt),
-        base_force=cfg.base_force,
-        max_gravity_z=cfg.max_gravity_z,
-        overflow_mask=0,  # counted, and no reason to end an episode
-    )
+    max_steps = round(cfg.episode_s / robot.control_dt)
+    # An overflow is counted, and no reason to end an episode.
+    return _fill(task, max_steps=max_steps, base_force=cfg.base_force, max_gravity_z=cfg.max_gravity_z, overflow_mask=0)
 
 
 def _make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
@@ -236,11 +228,8 @@ def _make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int
         promotion_distance=0.5 * _TILE_SIDE,
         demotion_time_s=0.5 * cfg.episode_s,
         command_steps=round(cfg.command_interval_s / control_dt),
-        lin_vel_x=cfg.lin_vel_x,
-        lin_vel_y=cfg.lin_vel_y,
-        min_speed=cfg.min_speed,
         push_steps=round(cfg.push_interval_s / control_dt),
-        push_speed=cfg.push_speed,
+        **{name: getattr(cfg, name) for name in ("lin_vel_x", "lin_vel_y", "min_speed", "push_speed")},
     )
 
 
