@@ -165,15 +165,7 @@ def begin_finetuning(
         }
     else:
         facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
-    mix = Mix(
-        kind=cfg.mix,
-        num_terrains=cfg.terrains,
-        swap_every=cfg.recipe.swap_every,
-        draw=cfg.recipe.draw,
-        elites=elites,
-        seed=cfg.seed,
-        device=device,
-    )
+    mix = Mix(cfg=cfg, elites=elites, device=device)
     return Training(
         robot, cfg, run_dir, device=device, settings=settings, saved=saved, mix=mix, facts=facts, start=start
     )

@@ -219,7 +219,7 @@ class Training:
         if self._mix is None:
             return
         iteration = self.learner.iteration
-        if iteration // self._mix.swap_every > self._mix.swap:
+        if iteration // self._mix.cfg.recipe.swap_every > self._mix.swap:
             self.task.exchange(self._mix.next(self.task.counts()))
             self.learner.begin()
         self.learner.alg.let_actor_learn(iteration >= self.critic_iterations)

@@ -1,12 +1,11 @@
 """Terrains of trainings: a grid of tiles, harder level by level, or a mix of two kinds, exchanged at intervals."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.robots.training import Draw
 from sim.terrains.bank import make_terrains
 from sim.terrains.hand_crafted import (
     CROSSING_TYPES,
@@ -20,7 +19,7 @@ from sim.terrains.hand_crafted import (
 )
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.terrains import GroundMaps
-from train.cfg import CurriculumCfg
+from train.cfg import CurriculumCfg, FinetuneCfg
 
 _MIX_KEY = 20250607  # with the seed and the number of the exchange, the entropy of its terrains
 _SAVED = ("rows", "episodes", "crossed")
@@ -90,16 +89,9 @@ class Mix:
     before. A checkpoint has them all, so a resumed training goes on with the same terrains.
     """
 
-    kind: Literal["generated", "hard-random", "hand-crafted"]
-    """Half of the terrains are elites (the paper's C-G) or hard-random (C-HR), half hand-crafted; or all are (C-HC)."""
-    num_terrains: int
-    swap_every: int
-    """Iterations after which the terrains are exchanged."""
-    draw: Draw = "uniform"
-    """How elites are drawn (:class:`train.cfg.RecipeCfg`)."""
+    cfg: FinetuneCfg
     elites: TrainingElites
     """Hand-crafted terrains are scaled by the smallest height share of their spaces."""
-    seed: int
     device: str
     goal_rate: NDArray[np.float64] | None = field(init=False)
     """Goal rate of each elite, shape (E,), which ``learnable`` uses until the elite is trained on; None: 0."""
@@ -114,8 +106,8 @@ class Mix:
 
     def __post_init__(self) -> None:
         self.num_elites = sum(map(len, self.elites.genes))
-        self.goal_rate = self.elites.goal_rate if self.draw == "learnable" else None
-        self.num_hand_crafted = self.num_terrains if self.kind == "hand-crafted" else self.num_terrains // 2
+        self.goal_rate = self.elites.goal_rate if self.cfg.recipe.draw == "learnable" else None
+        self.num_hand_crafted = self.cfg.terrains if self.cfg.mix == "hand-crafted" else self.cfg.terrains // 2
         self.episodes = np.zeros(self.num_elites, np.int64)
         self.crossed = np.zeros(self.num_elites, np.int64)
         self._before_resume = np.zeros((2, self.num_elites), np.int64)
@@ -143,12 +135,12 @@ class Mix:
         hand_crafted, numbers, _ = hand_crafted_crossings(first, rng)
         hand_crafted *= np.float32(min(space.height_share for space in self.elites.spaces))
         types = tuple(CROSSING_TYPES[number] for number in numbers)
-        if self.kind == "hand-crafted":
+        if self.cfg.mix == "hand-crafted":
             return Tiles(heights=hand_crafted, type_of_column=types)
-        count = self.num_terrains - first
+        count = self.cfg.terrains - first
         rows = self.rows
         genes = self.elites.genes
-        if self.kind == "hard-random":
+        if self.cfg.mix == "hard-random":
             rows = np.arange(count)
             genes = (self.elites.spaces[0].hard_random(count, rng),)
         heights = np.concatenate([hand_crafted, np.empty((count, NUM_ROWS, NUM_COLS), np.float32)])
@@ -166,7 +158,7 @@ class Mix:
             start += len(elites)
         is_plain = not any(space.ground or space.conditions for space in self.elites.spaces)
         ground = None if is_plain else ground[np.argsort(np.concatenate(order))]
-        return Tiles(heights=heights, type_of_column=(*types, *(self.kind,) * count), ground=ground)
+        return Tiles(heights=heights, type_of_column=(*types, *(self.cfg.mix,) * count), ground=ground)
 
     def state(self, counts: dict[str, NDArray[Any]]) -> dict[str, Any]:
         """Plain values for a checkpoint, with the counts on the present terrains so far."""
@@ -194,22 +186,22 @@ class Mix:
         return np.where(self.episodes > 0, self.crossed / np.maximum(self.episodes, 1), initial)
 
     def _rng(self, stream: int) -> np.random.Generator:
-        return np.random.default_rng([_MIX_KEY, self.seed, self.swap, stream])
+        return np.random.default_rng([_MIX_KEY, self.cfg.seed, self.swap, stream])
 
     def draw_rows(self) -> NDArray[np.int64]:
         """Elites of the next exchange: none twice, unless there are too few."""
-        if self.kind != "generated":
+        if self.cfg.mix != "generated":
             return np.zeros(0, np.int64)
         rng = self._rng(1)
         count = self.num_elites
-        num_drawn = self.num_terrains - self.num_hand_crafted
+        num_drawn = self.cfg.terrains - self.num_hand_crafted
         all_elites = np.tile(np.arange(count), num_drawn // count)
         rate = self.success()
         weights = {
             "uniform": np.ones(count),
             "failing": 1.0 - rate + _MIN_WEIGHT,
             "learnable": 4.0 * rate * (1.0 - rate) + _MIN_WEIGHT,
-        }[self.draw]
+        }[self.cfg.recipe.draw]
         if len(self.elites.genes) > 1:  # each archive gets an equal share
             by_archive = np.split(weights, np.cumsum([len(genes) for genes in self.elites.genes])[:-1])
             weights = np.concatenate([values / values.sum() if len(values) else values for values in by_archive])
@@ -219,9 +211,9 @@ class Mix:
     def _count_present(self, counts: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         """Valid episodes on each elite since the last exchange, and those that crossed it, shape (2, E)."""
         present = self._before_resume.copy()
-        if self.kind == "generated":
+        if self.cfg.mix == "generated":
             num_envs = len(counts["episodes"])
-            terrain = np.arange(num_envs) * self.num_terrains // num_envs  # as Tiles.assign_columns does
+            terrain = np.arange(num_envs) * self.cfg.terrains // num_envs  # as Tiles.assign_columns does
             on_elite = terrain >= self.num_hand_crafted
             rows = self.rows[terrain[on_elite] - self.num_hand_crafted]
             valid = counts["episodes"] - counts["invalid"]

@@ -8,17 +8,16 @@ from sim.terrains.hand_crafted import CROSSING_TYPES, NUM_COLS, NUM_LEVELS, NUM_
 from sim.terrains.spaces.course import COURSE
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from train.cfg import CurriculumCfg
+from train.cfg import CurriculumCfg, FinetuneCfg, RecipeCfg
 from train.task.tiles import Mix, TrainingElites, make_tiles
 
 ELITES = SUPER_GAUSSIAN.hard_random(7, 0)
 
 
-def make_mix(*, kind="generated", terrains=6, elites=ELITES, seed=0, **changes) -> Mix:
-    given = {"genes": (elites if kind == "generated" else ELITES[:0],), "spaces": (SUPER_GAUSSIAN,)}
-    given |= {name: changes.pop(name) for name in ("genes", "spaces", "goal_rate") if name in changes}
-    made = TrainingElites(**given)
-    return Mix(kind=kind, num_terrains=terrains, swap_every=1, elites=made, seed=seed, device="cpu", **changes)
+def make_mix(*, kind="generated", terrains=6, elites=ELITES, seed=0, draw="uniform", **changes) -> Mix:
+    given = {"genes": (elites if kind == "generated" else ELITES[:0],), "spaces": (SUPER_GAUSSIAN,), **changes}
+    cfg = FinetuneCfg(mix=kind, terrains=terrains, seed=seed, recipe=RecipeCfg(draw=draw))
+    return Mix(cfg=cfg, elites=TrainingElites(**given), device="cpu")
 
 
 def counts(goals, episodes, invalid=None):
