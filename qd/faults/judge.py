@@ -100,7 +100,7 @@ class Stage(ABC):
 
     def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
         """Refuses, before anything is crossed, what cannot be judged; ``before`` are the stages that come first."""
-        if archive.fresh is None and "fresh" not in before:
+        if archive.fresh is None and "fresh" not in (*before, self.name):
             raise ValueError(f"stages must begin with fresh, got none: {judging.search.run} has no fresh episodes")
 
     @abstractmethod
@@ -112,9 +112,6 @@ class Fresh(Stage):
     """Crosses every elite in 40 fresh episodes, since an elite is the best of many noisy evaluations."""
 
     name = "fresh"
-
-    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
-        """Any search can be judged."""
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with fresh values, families and causes, by descending corrected fitness."""

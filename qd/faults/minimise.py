@@ -323,8 +323,7 @@ def _choose_failing(archive: Archive, elite: str | None, search: Search, *, max_
     if elite.strip() == "all":
         return failing
     numbers = choose_elites(elite, range(len(archive)), f"{run} has no elite")
-    if crossed := [number for number in numbers if number not in failing]:
-        named = ", ".join(map(str, crossed))
+    if named := ", ".join(str(number) for number in numbers if number not in failing):
         raise ValueError(f"elite must name failing elites of {run}, got {named}: leave it out or try {failing[:5]}")
     return numbers
 
