@@ -80,8 +80,7 @@ class App:
     def leave(self, number: int) -> None:
         """Forget a closed tab."""
         self.bars.pop(number, None)
-        tab = self.tabs.pop(number, None)
-        if tab is not None:
+        if (tab := self.tabs.pop(number, None)) is not None:
             tab.leave()
 
     def show_progress(self, progress: TaskProgress) -> None:

@@ -204,7 +204,14 @@ class CrossingPanel:
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_markdown("")
         with gui.add_folder("Legend", expand_by_default=False):
-            gui.add_html(_render_legend())
+            names = ("slippery", "soft", "touch", "foot", "force", "command", "ghost")
+            colors = (SLIPPERY, SOFT, TOUCH, FOOT_TOUCH, FORCE_COLOR, COMMAND_COLOR, OTHER_CONTROLLER)
+            legend = TEMPLATES.get_template("legend.html").render(
+                ramp=", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0])))),
+                endings=[(ending.label, ending.color) for ending in ENDINGS.values()],
+                **dict(zip(names, map(to_hex, colors), strict=True)),
+            )
+            gui.add_html(legend)
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(_KEYS)
 
@@ -283,14 +290,3 @@ def _add_buttons(gui: Any, label: str, tasks: dict[str, tuple[Any, ...]], post: 
     """Buttons side by side, each with what the loop is to call."""
     buttons = gui.add_button_group(label, tuple(tasks))
     buttons.on_click(lambda event: post(*tasks[event.target.value]))
-
-
-def _render_legend() -> str:
-    """What the colours of the page mean."""
-    names = ("slippery", "soft", "touch", "foot", "force", "command", "ghost")
-    colors = (SLIPPERY, SOFT, TOUCH, FOOT_TOUCH, FORCE_COLOR, COMMAND_COLOR, OTHER_CONTROLLER)
-    return TEMPLATES.get_template("legend.html").render(
-        ramp=", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0])))),
-        endings=[(ending.label, ending.color) for ending in ENDINGS.values()],
-        **dict(zip(names, map(to_hex, colors), strict=True)),
-    )

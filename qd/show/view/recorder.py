@@ -124,7 +124,14 @@ class Recorder:
                     return
                 task = self._current = self._requests.pop(next(iter(self._requests)))
             try:
-                result = self._work_on(task)
+                if not self._is_ready:
+                    self.report(TaskProgress(task=task, text=_PREPARING))
+                self._worker.send(task, self.robot)
+                while (message := self._worker.receive())[0] != "result":
+                    self._is_ready = True
+                    if message[0] == "progress":
+                        self.report(TaskProgress(task=task, share=message[1]))
+                result = message[1]  # of the task, its error, or None if it was cancelled
             except (EvaluatorError, OSError) as error:
                 with self._changed:
                     if self._stopped:
@@ -141,14 +148,3 @@ class Recorder:
                 self.report(TaskProgress(task=task, text=str(result), failed=True))
             elif result is not None:
                 self.report(TaskProgress(task=task, share=1.0, result=result))
-
-    def _work_on(self, task: Any) -> Any:
-        """Result of a task, its error, or None if it was cancelled."""
-        if not self._is_ready:
-            self.report(TaskProgress(task=task, text=_PREPARING))
-        self._worker.send(task, self.robot)
-        while (message := self._worker.receive())[0] != "result":
-            self._is_ready = True
-            if message[0] == "progress":
-                self.report(TaskProgress(task=task, share=message[1]))
-        return message[1]

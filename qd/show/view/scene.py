@@ -34,12 +34,8 @@ SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, Non
 _BEHIND = np.array([-1.6, -2.4, 1.5])  # from the robot to the camera that follows it [m]
 PHONE = 576
 """Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
-_WAY_LIFT = 0.03  # over the ground [m]
-_POST_HEIGHT = 1.0
-_POST_RADIUS = 0.03
 _START_RADIUS = 0.25
 _DISC: Any = {"height": 0.02, "opacity": 0.5, "cast_shadow": False}
-_GHOST_NAME_HEIGHT = 0.35  # over its base [m]
 
 Points = NDArray[np.floating]
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -174,11 +170,10 @@ class Scene:
             scene.add_label("/start/label", "start", position=before, anchor="top-center")
             radius = CrossingCfg.goal_radius
             scene.add_cylinder("/goal/disc", radius, color=_GOAL_COLOR, position=(*goal, high), **_DISC)
-            middle, top = ((*goal, high + share * _POST_HEIGHT) for share in (0.5, 1.0))
-            scene.add_cylinder("/goal/post", _POST_RADIUS, _POST_HEIGHT, _GOAL_COLOR, position=middle)
-            scene.add_label("/goal/label", "goal", position=top, anchor="bottom-center")
+            scene.add_cylinder("/goal/post", 0.03, 1.0, _GOAL_COLOR, position=(*goal, high + 0.5))
+            scene.add_label("/goal/label", "goal", position=(*goal, high + 1.0), anchor="bottom-center")
             way = np.linspace(start, goal, round(math.dist(start, goal) / SPACING) + 1)  # along the ground
-            points = np.column_stack([way, surface_heights(heights, *way.T) + _WAY_LIFT])
+            points = np.column_stack([way, surface_heights(heights, *way.T) + 0.03])
             dashes = np.stack([points[:-1], points[1:]], axis=1)[::2]
             scene.add_line_segments("/way/line", dashes, colors=(240, 200, 60), thickness=0.02)
 
@@ -194,12 +189,11 @@ class Scene:
         for handle in self.paths:
             handle.remove()
         self.paths = []
-        ends = [np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths]
-        colors = [np.broadcast_to(np.array(color), lines.shape) for lines, (_, color) in zip(ends, paths, strict=True)]
         if paths:
+            ends = np.concatenate([np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths])
+            colors = np.concatenate([np.tile(color, (len(points[1:]), 2, 1)) for points, color in paths])
             look: Any = {"thickness": 1.2, "thickness_units": "screen", "visible": not self.follow}
-            light = in_linear_light(np.concatenate(colors))
-            self.paths = [self._client.scene.add_line_segments("/paths", np.concatenate(ends), colors=light, **look)]
+            self.paths = [self._client.scene.add_line_segments("/paths", ends, in_linear_light(colors), **look)]
 
     def set_follow(self, follow: bool) -> None:
         """Follow the robot from now on, or stay."""
@@ -239,7 +233,7 @@ class Scene:
             _move_bodies(self.ghost_bodies, crossing, frame)
             self._ghost_name.text = label
             self._ghost_name.visible = bool(label)
-            self._ghost_name.position = tuple(crossing.positions[frame, 0] + np.array([0.0, 0.0, _GHOST_NAME_HEIGHT]))
+            self._ghost_name.position = tuple(crossing.positions[frame, 0] + [0.0, 0.0, 0.35])
 
     def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, **look: Any) -> Any:
         """A shape of one colour; by default invisible and without shadow."""

@@ -251,20 +251,6 @@ class Tab:
             self._film = None
             self.panel.show_film("Cancelled.")
 
-    def _show_film_progress(self, progress: TaskProgress) -> None:
-        """Show how far the film is, and offer it when it is made."""
-        if progress.result is not None:
-            self._film = None
-            content = progress.result.read_bytes()
-            size = f"{len(content) / 1e6:.1f} MB"
-            self.panel.show_film(f"{progress.result} ({size}): click to download it in the notice on the picture.")
-            self.client.send_file_download(progress.result.name, content)
-        elif progress.failed:
-            self._film = None
-            self.panel.show_film(f"No film: {progress.text}")
-        else:
-            self.panel.show_film(f"Filming: {progress.share:.0%}")
-
     @property
     def minimal(self) -> bool:
         """Whether a minimal terrain is shown."""
@@ -357,7 +343,15 @@ class Tab:
     def show_progress(self, progress: TaskProgress) -> None:
         """Show how far a recording or film is, and what it made, if this tab requested it."""
         if self._film is not None and progress.task is self._film:
-            self._show_film_progress(progress)
+            if progress.failed or progress.result is not None:
+                self._film = None
+            text = f"No film: {progress.text}" if progress.failed else f"Filming: {progress.share:.0%}"
+            if progress.result is not None:
+                content = progress.result.read_bytes()
+                size = f"{len(content) / 1e6:.1f} MB"
+                text = f"{progress.result} ({size}): click to download it in the notice on the picture."
+                self.client.send_file_download(progress.result.name, content)
+            self.panel.show_film(text)
         if self.ghost.take(progress):
             self._show_ghost(f"no ghost: {progress.text}" if progress.failed else f"{progress.share:.0%}")
             self._show_rates()

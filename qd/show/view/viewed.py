@@ -113,15 +113,13 @@ class ViewedRun(OpenedRun):
 
     def render_map(self, listed: NDArray[np.int64], picked: int) -> str:
         """HTML of a map of where the typical episode of each elite ends; a click on one shows it (``page.js``)."""
-        drawn = [*np.setdiff1d(np.arange(len(self.archive)), listed), *listed[::-1]]
-        colors = dict.fromkeys(drawn, _GREY) | dict.fromkeys(listed, _LISTED)
-        colors.pop(picked)
-        positions = self.ranking.end_position
-        dots = [
-            (number, positions[number].tolist(), color, 6 if color == _PICKED else 3)
-            for number, color in (colors | {picked: _PICKED}).items()
-            if np.isfinite(positions[number]).all()
-        ]
+        others = np.setdiff1d(np.arange(len(self.archive)), listed).tolist()
+        looks: dict[int, tuple[str, int]] = dict.fromkeys(others, (_GREY, 3))
+        looks |= dict.fromkeys(listed[::-1].tolist(), (_LISTED, 3))
+        del looks[picked]  # it is drawn over the others
+        looks[picked] = (_PICKED, 6)
+        ends = self.ranking.end_position.tolist()
+        dots = [(number, ends[number], *look) for number, look in looks.items() if np.isfinite(ends[number]).all()]
         template = TEMPLATES.get_template("map.html")
         return template.render(dots=dots, names=self._names, start=CrossingCfg.start, goal=CrossingCfg.goal)
 

@@ -31,6 +31,7 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 LIMIT_MS = 120_000
 """From a click to what it shows, on a busy machine that draws without a GPU."""
 SETTLE_MS = 4000  # for the last frames of a browser that draws without a GPU
+PLAYS = "button === 'Pause'"
 WITHOUT_GPU = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -70,10 +71,8 @@ def open_chromium():
     """The browser, closed in the end."""
     from playwright.sync_api import sync_playwright
 
-    with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=BROWSER, args=WITHOUT_GPU)
+    with sync_playwright() as started, started.chromium.launch(executable_path=BROWSER, args=WITHOUT_GPU) as browser:
         yield browser
-        browser.close()
 
 
 def said(page):
@@ -96,11 +95,6 @@ def wait_for(page, script):
     page.wait_for_function(f"() => {{ {bar} return {script}; }}", timeout=LIMIT_MS)
 
 
-def until_it_plays(page):
-    """Waits until the robot plays."""
-    wait_for(page, "button === 'Pause'")
-
-
 def take(page, file: Path) -> None:
     """Writes what a page shows."""
     for close in page.locator(".mantine-Notification-closeButton").all():  # such as that there is no GPU
@@ -119,7 +113,7 @@ def main() -> None:
         with serve("--run", "results/anymal/archive") as address:
             page = browser.new_page(viewport={"width": 1366, "height": 768})
             page.goto(address, timeout=LIMIT_MS)
-            until_it_plays(page)
+            wait_for(page, PLAYS)
             wait_for(page, "/Ghost, .* after/.test(document.querySelector('#faultline .words').textContent)")
             page.get_by_title("end: ").locator("span").click(timeout=LIMIT_MS)
             page.keyboard.press("Space")

@@ -27,11 +27,6 @@ def show(anymal, published):
     return open_viewed_run(published / "anymal" / "archive", elite="0", policies=policies)
 
 
-def wanted_of(recorder):
-    """What a recorder was asked for."""
-    return [call.args[0] for call in recorder.request.call_args_list]
-
-
 class Shown:
     """A viewer with one tab, and what its visitor does; what it would record is kept in ``asked``."""
 
@@ -43,7 +38,8 @@ class Shown:
 
     @property
     def asked(self):
-        return [wanted for wanted in wanted_of(self.recorder) if wanted is not None and "panel" not in wanted.policy]
+        asked = [call.args[0] for call in self.recorder.request.call_args_list]
+        return [wanted for wanted in asked if wanted is not None and "panel" not in wanted.policy]
 
     def come(self, query="") -> Tab:
         """The tab of another visitor, whose address says so."""
@@ -282,15 +278,16 @@ def test_a_film_is_made_and_offered_or_cancelled(shown, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tab = shown.tab
     shown.do((tab.film,))
-    wanted = wanted_of(shown.recorder)[-1]
+    wanted = shown.recorder.request.call_args.args[0]
     assert wanted.keywords["out"].name == f"elite-0-base-episode-{tab.replica + 1}.mp4"
     shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="", share=0.4)))
     assert "40%" in tab.panel.film_status.content
     shown.do((tab.cancel_film,), (tab.film,))
     shown.recorder.cancel.assert_called_once_with(wanted)
+    wanted = shown.recorder.request.call_args.args[0]
     made = tmp_path / "film.mp4"
     made.write_bytes(bytes(1_500_000))
-    shown.do((shown.app.show_progress, TaskProgress(task=wanted_of(shown.recorder)[-1], text="", result=made)))
+    shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="", result=made)))
     assert "film.mp4 (1.5 MB)" in tab.panel.film_status.content
 
 

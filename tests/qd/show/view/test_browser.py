@@ -5,7 +5,7 @@ import re
 import pytest
 
 from tests.qd.show.view import browser
-from tests.qd.show.view.browser import LIMIT_MS, open_chromium, said, serve, until_it_plays, wait_for, wait_until
+from tests.qd.show.view.browser import LIMIT_MS, PLAYS, open_chromium, said, serve, wait_for, wait_until
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 pytestmark = [
@@ -53,13 +53,13 @@ def opened(chromium, address):
 
 def test_it_opens_on_the_moment_and_an_elite_of_the_list_does_too(opened):
     page = opened()
-    until_it_plays(page)
+    wait_for(page, PLAYS)
     wait_until(page, lambda now: now.get("elite") == "0" and now.get("follow") == "1" and float(now.get("t", 0)) > 0)
     row = page.locator(".faultline-list [data-elite]").nth(1)
     number = row.get_attribute("data-elite")
     row.click()
     wait_until(page, lambda now: now["elite"] == number)
-    until_it_plays(page)
+    wait_for(page, PLAYS)
     page.go_back()  # the elites are the page's history
     wait_until(page, lambda now: now["elite"] == "0")
     field = page.get_by_placeholder("number, Enter")
@@ -83,7 +83,7 @@ def test_keys_and_the_bar_move_time(opened):
     wait_until(page, lambda now: now["t"] == "0")
     assert said(page)["initialCameraPosition"] == camera  # arrows are the time's, not the camera's
     page.get_by_role("button", name="Play").click()
-    until_it_plays(page)
+    wait_for(page, PLAYS)
     page.keyboard.press("Space")  # the button has not kept the keys: once, not twice
     wait_for(page, "button === 'Play'")
     page.get_by_title(re.compile("^end: ")).locator("span").click()
