@@ -39,16 +39,9 @@ class Scene:
     """Robots in the middle of gene terrains, with a command and random actions; all on the device."""
 
     rollout: Rollout
-    genes: np.ndarray
-    """Shape (num_terrains, 64)."""
-    command: Any
-    """Shape (num_envs, 3)."""
-    last_action: Any
-    """Shape (num_envs, num_joints)."""
-
-    @property
-    def num_envs(self) -> int:
-        return self.rollout.num_envs
+    genes: np.ndarray  # (num_terrains, 64)
+    command: Any  # (num_envs, 3)
+    last_action: Any  # (num_envs, num_joints)
 
 
 def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: int, walk_s: float, seed: int) -> Scene:
@@ -77,32 +70,24 @@ class Case:
 
     name: str
     launch: Callable[[], None]
-    output: Any
-    """Warp array that it writes; cleared before a comparison."""
+    output: Any  # Warp array that it writes; cleared before a comparison
     counterpart: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    """What the counterpart is called with."""
+    arguments: tuple[Any, ...]  # of the counterpart
     work: Work
     atol: float
     rtol: float = 0.0
-    undecided: float = 0.0
-    """Share of values that may differ more, since single precision may go either way there."""
-    read: Callable[[], np.ndarray] | None = None
-    """What the kernel wrote; if left out, ``output`` as it is."""
+    undecided: float = 0.0  # share of values that may differ more: single precision may go either way there
+    read: Callable[[], np.ndarray] | None = None  # what the kernel wrote; if left out, ``output`` as it is
     read_torch: Callable[[Any], np.ndarray] = lambda tensor: tensor.cpu().numpy()
-
-    def run_kernel(self) -> np.ndarray:
-        """What one launch writes."""
-        self.output.zero_()
-        self.launch()
-        return (self.read() if self.read else self.output.numpy()).copy()
 
     def compare(self, outputs: Any) -> None:
         """Refuses outputs of the counterpart that are not the kernel's: nothing may be timed then.
 
         NaN stands for what is absent.
         """
-        ours, theirs = self.run_kernel(), self.read_torch(outputs)
+        self.output.zero_()
+        self.launch()
+        ours, theirs = self.read() if self.read else self.output.numpy(), self.read_torch(outputs)
         if ours.shape != theirs.shape:
             raise ValueError(f"{self.name}: torch gives shape {theirs.shape}, the kernel {ours.shape}")
         near = np.abs(ours - theirs) <= self.atol + self.rtol * np.abs(theirs)
@@ -111,13 +96,10 @@ class Case:
         # Of few contacts, one may be undecided.
         allowed = max(self.undecided * present, ours.shape[-1]) if self.undecided else 0
         if not present or differing.sum() > allowed:
-            first = ", ".join(
-                f"{theirs[place]:.9g} and {ours[place]:.9g} at {place}"
-                for place in [tuple(index.tolist()) for index in np.argwhere(differing)[:3]]
-            )
-            raise ValueError(
-                f"{self.name}: of {present} values of torch {differing.sum()} differ from the kernel's: {first}"
-            )
+            indices = map(tuple, np.argwhere(differing)[:3].tolist())
+            first = ", ".join(f"{theirs[index]:.9g} and {ours[index]:.9g} at {index}" for index in indices)
+            counts = f"of {present} values of torch {differing.sum()} differ"
+            raise ValueError(f"{self.name}: {counts} from the kernel's: {first}")
 
 
 def _share_within_reach(genes: np.ndarray) -> float:
@@ -142,16 +124,14 @@ def _rasterise_case(scene: Scene) -> Case:
     # A node and bump: two rotated, scaled coordinates (7), two comparisons; within reach of the bump two powers, one
     # exponential, and six more flops for signs, product and sum.
     pairs = heights.size * genes.shape[1] // len(LOWER)
-    near = _share_within_reach(scene.genes) * pairs
+    near, moved = _share_within_reach(scene.genes) * pairs, FLOAT * (genes.size + heights.size)
     return Case(
         name="rasterise",
         launch=lambda: rasterise(genes, SPACING, heights),
         output=heights,
         counterpart=counterparts.rasterise,
         arguments=(wp.to_torch(genes), lower, upper, x, y),
-        work=Work(
-            bytes=FLOAT * (genes.size + heights.size), flops=9 * pairs + round(6 * near), specials=round(5 * near)
-        ),
+        work=Work(bytes=moved, flops=9 * pairs + round(6 * near), specials=round(5 * near)),
         atol=2e-5,  # steep flanks cost single precision two digits
     )
 
@@ -166,18 +146,16 @@ def _kernel_contacts(scene: Scene, tables: counterparts.ProbeTables) -> np.ndarr
     if count.max() > capacity:
         raise ValueError(f"{count.max()} contacts of a robot do not fit in {capacity}: raise its nconmax")
     env, slot = np.nonzero(np.arange(capacity) < count[:, None])
-    shape, point, normal, distance = (
-        getattr(sim.contacts, name).numpy()[env, slot] for name in ("shape", "point", "normal", "distance")
-    )
-    body_q = wp.to_torch(sim.body_q)
-    centres = counterparts.probe_centres(body_q, counterparts.rotation_matrices(body_q[..., 3:]), tables).cpu().numpy()
+    names = ("shape", "point", "normal", "distance")
+    shape, point, normal, distance = (getattr(sim.contacts, name).numpy()[env, slot] for name in names)
+    centres = counterparts.probe_centres(wp.to_torch(sim.body_q), tables).cpu().numpy()
     radius, distance = tables.radius.cpu().numpy(), distance[:, None]
     # The point is half way between the surfaces, from where a radius and half of the distance lead to the centre.
     found = point[:, None] + normal[:, None] * (0.5 * distance + radius)[..., None]
     shape_of_probe = np.repeat(sim.probes.strip_shape.numpy(), np.diff(sim.probes.strip_start.numpy()))
     away = np.abs(found - centres[env]).sum(2)
     probe = np.argmin(np.where(shape_of_probe == shape[:, None], away, np.inf), axis=1)
-    values = np.full((scene.num_envs, len(radius), 7), np.nan, np.float32)
+    values = np.full((sim.num_envs, len(radius), 7), np.nan, np.float32)
     values[env, probe] = np.concatenate([point, normal, distance], axis=1)
     return values
 
@@ -217,22 +195,13 @@ def _contact_case(scene: Scene) -> Case:
 
 
 def _observation_case(scene: Scene) -> Case:
-    sim = scene.rollout.sim
-    out = wp.zeros((scene.num_envs, scene.rollout.robot.observation_size), dtype=float)
+    sim, robot = scene.rollout.sim, scene.rollout.robot
+    out = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
     seed = wp.zeros(1, dtype=int)
     step = sim.make_step(scene.command, scene.last_action)
-    arrays = (
-        sim.joint_q,
-        sim.joint_qd,
-        scene.command,
-        scene.last_action,
-        sim.terrain_of_env,
-        sim.bank.heights,
-        sim.sensors.scan_x,
-        sim.sensors.scan_y,
-        sim.sensors.default_joint_pos,
-    )
-    tensors = [wp.to_torch(array) for array in arrays]
+    states = (sim.joint_q, sim.joint_qd, scene.command, scene.last_action, sim.terrain_of_env, sim.bank.heights)
+    constants = (sim.sensors.scan_x, sim.sensors.scan_y, sim.sensors.default_joint_pos)
+    tensors = [wp.to_torch(array) for array in (*states, *constants)]
 
     def constant(*values: float) -> torch.Tensor:
         return torch.tensor(values, dtype=torch.float32, device=tensors[0].device)
@@ -240,16 +209,16 @@ def _observation_case(scene: Scene) -> Case:
     scale = constant(LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE)
     # A scan point: three nodes read, one value written; rotation (8), cell and interpolation (10), clip (4). Joint
     # coordinates and velocities, command and action read; three vectors turned into the base (100).
-    points, joints = scene.rollout.robot.num_scan_points, scene.rollout.robot.num_joints
+    points, joints = robot.num_scan_points, robot.num_joints
     values = 4 * points + (7 + 1) + (2 * joints + 6) + 3 + joints + (12 + 3 * joints)
-    flops = scene.num_envs * (22 * points + 100 + 3 * joints)
+    flops = sim.num_envs * (22 * points + 100 + 3 * joints)
     return Case(
         name="observation",
         launch=lambda: write_observation(step, sim.terrain_of_env, sim.bank.terrain, sim.sensors, Noise(), seed, out),
         output=out,
         counterpart=counterparts.observation,
         arguments=(*tensors, constant(*sim.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),
-        work=Work(bytes=FLOAT * scene.num_envs * values, flops=flops),
+        work=Work(bytes=FLOAT * sim.num_envs * values, flops=flops),
         atol=5e-4,
         rtol=1e-5,
     )
@@ -257,15 +226,14 @@ def _observation_case(scene: Scene) -> Case:
 
 def _penalties_case(scene: Scene) -> Case:
     sim, robot = scene.rollout.sim, scene.rollout.robot
-    sums = wp.zeros((scene.num_envs, len(PENALTIES)), dtype=float)
-    counted = wp.ones(scene.num_envs, dtype=int)
+    sums, counted = wp.zeros((sim.num_envs, len(PENALTIES)), dtype=float), wp.ones(sim.num_envs, dtype=int)
     roles = sim.geom_role.numpy()
     joint_q, joint_qd, command, force = map(wp.to_torch, (sim.joint_q, sim.joint_qd, scene.command, sim.geom_force))
     feet, others = (torch.tensor(np.flatnonzero(roles & role), device=force.device) for role in (FOOT, BASE | LIMB))
     base_com = torch.tensor(list(sim.base_com), dtype=torch.float32, device=force.device)
-    limits = (robot.contact_force_limit, robot.physics_dt)
-    step = sim.make_step(scene.command, scene.last_action)
-    columns = penalty_columns(counterparts.PENALTIES)
+    step, columns = sim.make_step(scene.command, scene.last_action), penalty_columns(counterparts.PENALTIES)
+    before = torch.zeros((sim.num_envs, len(columns)), device=force.device)
+    state = (joint_q, joint_qd, base_com, command, force, feet, others)
     # Base state, command, forces and flag read, six sums read and written; two vectors turned, ten flops a geom.
     geoms = len(robot.geom_names)
     values = 4 + 6 + 3 + 3 * geoms + 1 + 2 * len(PENALTIES)
@@ -274,15 +242,12 @@ def _penalties_case(scene: Scene) -> Case:
         launch=lambda: add_penalties(step, robot.physics_dt, counted, sums),
         output=sums,
         counterpart=counterparts.penalties,
-        arguments=(
-            joint_q, joint_qd, base_com, command, force, feet, others, wp.to_torch(counted),
-            torch.zeros((scene.num_envs, len(columns)), device=force.device), *limits,
-        ),
-        work=Work(bytes=FLOAT * scene.num_envs * values, flops=scene.num_envs * (80 + 10 * geoms)),
+        arguments=(*state, wp.to_torch(counted), before, robot.contact_force_limit, robot.physics_dt),
+        work=Work(bytes=FLOAT * sim.num_envs * values, flops=sim.num_envs * (80 + 10 * geoms)),
         read=lambda: sums.numpy()[:, columns],
         atol=1e-6,
         rtol=5e-5,
-    )  # fmt: skip
+    )
 
 
 def _geom_forces_case(scene: Scene) -> Case:

@@ -24,10 +24,8 @@ MAX_LAUNCHES = 200
 class Timing:
     """How long to time."""
 
-    rounds: int = 20
-    """Replays of each variant, in turns; the median counts."""
-    replay_s: float = 2e-3
-    """Wanted length of one replay [s]: as many launches as that takes, at most 200."""
+    rounds: int  # replays of each variant, in turns; the median counts
+    replay_s: float  # wanted length of one replay [s]: as many launches as that takes, at most 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,10 +34,8 @@ class Variant:
 
     replay: Callable[[], None]
     launches: int
-    work: Callable[[], object]
-    """What one launch does; a graph knows only the addresses of its arrays, this keeps them alive."""
-    outputs: list[Any] = field(default_factory=list)
-    """What the last launch of a torch variant returned; overwritten by each replay."""
+    work: Callable[[], object]  # what one launch does; keeps the arrays alive of which a graph knows the addresses
+    outputs: list[Any] = field(default_factory=list)  # of the last launch of torch; overwritten by each replay
 
 
 def repeat_warp(launch: Callable[[], None], launches: int, device: str) -> Variant:
@@ -166,14 +162,10 @@ class Work:
 class Ceiling:
     """Best rates of a device."""
 
-    copies: dict[int, float]
-    """Bytes a second, read and written, by bytes moved."""
-    flops_per_s: float
-    """Single-precision multiplications and additions a second."""
-    specials_per_s: float
-    """Single-precision exponentials a second."""
-    launch_s: float
-    """Time of an empty kernel in a captured graph [s]."""
+    copies: dict[int, float]  # bytes a second, read and written, by bytes moved
+    flops_per_s: float  # single-precision multiplications and additions a second
+    specials_per_s: float  # single-precision exponentials a second
+    launch_s: float  # time of an empty kernel in a captured graph [s]
 
     def bytes_per_s(self, moved: int) -> float:
         """Rate of the fastest copy of at least ``moved`` bytes."""
@@ -191,10 +183,10 @@ class Ceiling:
             "arithmetic": work.flops / self.flops_per_s / seconds,
             "special functions": work.specials / self.specials_per_s / seconds,
         }
-        nearest = max(shares, key=lambda name: shares[name])
-        if shares[nearest] >= BOUND_SHARE:
-            return shares[nearest], nearest
-        return shares[nearest], "launch" if self.launch_s / seconds >= LAUNCH_SHARE else "latency"
+        share, nearest = max(zip(shares.values(), shares, strict=True))
+        if share < BOUND_SHARE:
+            nearest = "launch" if self.launch_s / seconds >= LAUNCH_SHARE else "latency"
+        return share, nearest
 
 
 def launch(kernel: Any, out: Any, *inputs: int) -> None:

@@ -241,22 +241,20 @@ def from_surface(
     return vectors.gather(2, nearest[..., None, None].expand(-1, -1, 1, 3)).squeeze(2)
 
 
-def probe_centres(body_q: Tensor, rotation: Tensor, tables: ProbeTables) -> Tensor:
-    """World centres (E, P, 3) of all probes."""
+def probe_centres(body_q: Tensor, tables: ProbeTables) -> Tensor:
+    """World centres (E, P, 3) of all probes of bodies with poses (E, bodies, 7)."""
+    rotation = rotation_matrices(body_q[..., 3:])  # (E, bodies, 3, 3)
     return body_q[:, tables.body, :3] + (rotation[:, tables.body] * tables.position[:, None, :]).sum(-1)
 
 
 def probe_contacts(
-    body_q: Tensor, rotation: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
-) -> tuple[Tensor, Tensor, Tensor]:
-    """World centres (E, P, 3), signed distances (E, P) and normals (E, P, 3) of all probes, exact where they touch."""
-    centre = probe_centres(body_q, rotation, tables)
-    vectors = [
-        from_surface(heights, terrain_of_env, spacing, centre[:, group], radius, window)
-        for radius, window, group in tables.groups
-    ]
+    centre: Tensor, terrain_of_env: Tensor, heights: Tensor, spacing: float, tables: ProbeTables
+) -> tuple[Tensor, Tensor]:
+    """Signed distances (E, P) and normals (E, P, 3) of probes with world centres (E, P, 3), exact where they touch."""
+    terrain = (heights, terrain_of_env, spacing)
+    vectors = [from_surface(*terrain, centre[:, group], radius, window) for radius, window, group in tables.groups]
     vector = torch.cat(vectors, dim=1)[:, tables.order]
-    ground, slope_x, slope_y = surface(heights, terrain_of_env, spacing, centre[..., 0], centre[..., 1])
+    ground, slope_x, slope_y = surface(*terrain, centre[..., 0], centre[..., 1])
     upward = torch.nn.functional.normalize(torch.stack([-slope_x, -slope_y, torch.ones_like(slope_x)], dim=-1), dim=-1)
     size, gap = vector.norm(dim=2), centre[..., 2] - ground
     below = gap < 0.0
@@ -264,7 +262,7 @@ def probe_contacts(
     distance = torch.where(deep, gap * upward[..., 2], torch.where(below, -size, size))
     vertical = deep | (size <= _ON_SURFACE)
     normal = torch.where(vertical[..., None], upward, vector / distance.masked_fill(vertical, 1.0)[..., None])
-    return centre, distance, normal
+    return distance, normal
 
 
 def choose_probes(distance: Tensor, tables: ProbeTables) -> Tensor:
@@ -293,8 +291,8 @@ def collide(
         Probe of each slot, -1 where there is no contact, (E, S, 3); points in the middle between the surfaces, normals,
         (E, S, 3, 3) each, and distances of the surfaces, (E, S, 3, 1), world frame.
     """
-    rotation = rotation_matrices(body_q[..., 3:])  # (E, bodies, 3, 3)
-    centre, distance, normal = probe_contacts(body_q, rotation, terrain_of_env, heights, spacing, tables)
+    centre = probe_centres(body_q, tables)
+    distance, normal = probe_contacts(centre, terrain_of_env, heights, spacing, tables)
     chosen = choose_probes(distance, tables)
     probe = chosen.clamp(min=0)
     of_slot = torch.arange(len(probe), device=probe.device)[:, None, None], probe

@@ -210,25 +210,23 @@ def test_penalties_equal_the_oracle():
     np.testing.assert_allclose(sums_after(states, command, forces), PHYSICS_DT * expected, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("forces", "contact_force", "stumble", "collision"),
-    [
+def test_contact_penalties_by_hand():
+    steps = [  # forces, and what they cost: contact_force, stumble, collision
         # Feet of 600 N and 500.5 N against a limit of 500: (100 + 0.5) * 0.005 = 0.5025. Norms, in any direction.
-        (forces(g3=(0, 0, 600), g4=(300.3, 0, 400.4)), 0.5025, 0, 0),
+        (forces(g3=(0, 0, 600), g4=(300.3, 0, 400.4)), (0.5025, 0, 0)),
         # Sideways 5.1 to 1: stumble, once for both feet. 5 to 1 exactly and below is none.
-        (forces(g3=(51, 0, 10), g4=(0, -51, -10)), 0, 0.005, 0),
-        (forces(g3=(50, 0, 10), g4=(30, 39.9, 10)), 0, 0, 0),
+        (forces(g3=(51, 0, 10), g4=(0, -51, -10)), (0, 0.005, 0)),
+        (forces(g3=(50, 0, 10), g4=(30, 39.9, 10)), (0, 0, 0)),
         # Base and one limb touch harder than 0.1 N, the other limb with 0.09 N: 2 * 0.005.
-        (forces(g0=(0, 0, 0.2), g1=(0.11, 0, 0), g2=(0, 0, 0.09)), 0, 0, 0.01),
+        (forces(g0=(0, 0, 0.2), g1=(0.11, 0, 0), g2=(0, 0, 0.09)), (0, 0, 0.01)),
         # A foot never collides; base and limbs have no force limit and do not stumble.
-        (forces(g0=(900, 0, 0), g3=(0, 0, 400)), 0, 0, 0.005),
-        (forces(), 0, 0, 0),
-    ],
-)
-def test_contact_penalties_by_hand(forces, contact_force, stumble, collision):
-    sums = sums_after(upright(1, 3), [[0, 0, 0]], forces[None])
+        (forces(g0=(900, 0, 0), g3=(0, 0, 400)), (0, 0, 0.005)),
+        (forces(), (0, 0, 0)),
+    ]
+    force, expected = zip(*steps, strict=True)
+    sums = sums_after(upright(len(steps), 3), np.zeros((len(steps), 3)), force)
     columns = penalty_columns(["contact_force", "stumble", "collision"])
-    np.testing.assert_allclose(sums[0, columns], [contact_force, stumble, collision], atol=1e-6)
+    np.testing.assert_allclose(sums[:, columns], expected, atol=1e-6)
 
 
 def test_steps_that_do_not_count_add_nothing():

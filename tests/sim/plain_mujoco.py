@@ -55,14 +55,12 @@ def cross_and_keep(robot, policy, heights, starts, seconds, **how):
 
 def rays_from_above(model: mujoco.MjModel, points, qpos=None, groups=None):
     """Where rays straight down from 9 m meet a model's geoms (of some groups alone): heights [m] and geoms."""
-    data, heights, geoms = mujoco.MjData(model), [], []
+    data, down, heights, geoms = mujoco.MjData(model), np.array([0, 0, -1.0]), [], []
     if qpos is not None:
         data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     for x, y in points:
         geom = np.zeros(1, np.int32)
-        heights.append(
-            9.0 - mujoco.mj_ray(model, data, np.array([x, y, 9.0]), np.array([0, 0, -1.0]), groups, 1, -1, geom)
-        )
+        heights.append(9.0 - mujoco.mj_ray(model, data, np.array([x, y, 9.0]), down, groups, 1, -1, geom))
         geoms.append(int(geom[0]))
     return np.array(heights), np.array(geoms)

@@ -50,22 +50,9 @@ def free_body(folder: Path, geom: str, *, mass: float, friction: float = 0.5) ->
         '<mujoco><worldbody><body name="body"><freejoint/>'
         f'<geom name="body" {geom} mass="{mass}" friction="{friction}"/></body></worldbody></mujoco>'
     )
-    return RobotCfg(
-        name="body",
-        model_file=file,
-        base_geoms=(),
-        foot_geoms=("body",),
-        limb_geoms=(),
-        joint_names=(),
-        default_joint_pos=(),
-        default_base_height=1.0,
-        footprint=(0.1, 0.1),
-        scan_x=(),
-        scan_y=(),
-        contact_force_limit=500.0,
-        penalties=(),
-        collision_bit=False,
-    )
+    names = ("base_geoms", "limb_geoms", "joint_names", "default_joint_pos", "scan_x", "scan_y", "penalties")
+    sizes = {"default_base_height": 1.0, "footprint": (0.1, 0.1), "contact_force_limit": 500.0, "collision_bit": False}
+    return RobotCfg(name="body", model_file=file, foot_geoms=("body",), **dict.fromkeys(names, ()), **sizes)
 
 
 def simulate(robot: RobotCfg, grids: np.ndarray, device: str, ground: GroundMaps | None = None) -> Simulation:

@@ -128,19 +128,13 @@ def test_wrong_input_is_named(rollout):
             rollout.evaluate(Terrains(heights=np.zeros((num_terrains, 64)), seeds=np.arange(num_seeds)))
 
 
-NOTHING = {field.name: 0.0 for field in fields(RewardCfg)}
 DT = 0.02
 
 
 def reward_only(robot, only_positive=False, **weights):
     """A robot whose training pays for some terms alone."""
-    return replace(robot, training=TrainingCfg(rewards=RewardCfg(**NOTHING | weights), only_positive=only_positive))
-
-
-@pytest.fixture(scope="module")
-def tracker(anymal):
-    """Paid for its velocity alone."""
-    return reward_only(anymal, tracking_lin_vel=1.0)
+    nothing = {field.name: 0.0 for field in fields(RewardCfg)}
+    return replace(robot, training=TrainingCfg(rewards=RewardCfg(**nothing | weights), only_positive=only_positive))
 
 
 def rewarded(robot, device, policy=stand, **more):
@@ -149,13 +143,13 @@ def rewarded(robot, device, policy=stand, **more):
     return crossing(robot, device, policy, **dict.fromkeys(ranges, 0.0) | {"reward": True} | more)
 
 
-def test_after_the_goal_the_command_is_to_stand_and_rewards_go_on(tracker, device):
+def test_after_the_goal_the_command_is_to_stand_and_rewards_go_on(anymal, device):
     # At the goal with the first physics step; the first command was to walk, the 29 after it to stand:
     # .02 s * (exp(-2.25) + 29) = .582.
-    rollout = rewarded(tracker, device, start=(14.3, 4.0))
+    rollout = rewarded(reward_only(anymal, tracking_lin_vel=1.0), device, start=(14.3, 4.0))
     result = rollout.evaluate(Terrains(heights=FLAT[None], seeds=np.array([1])))
     assert result.reached_goal.all()
-    np.testing.assert_allclose(result.duration_s, tracker.physics_dt, atol=1e-6)
+    np.testing.assert_allclose(result.duration_s, anymal.physics_dt, atol=1e-6)
     assert result.physics_steps == 120
     np.testing.assert_allclose(result.reward, DT * (math.exp(-2.25) + 29), rtol=0.01)
     assert (positions(rollout.sim)[:, 2] < 1.0).all()  # it stands there, and is not parked
@@ -176,8 +170,8 @@ def test_a_base_collision_costs_its_price_once_and_nothing_is_paid_after_it(anym
     assert ((totals[0] > -4.0) & (totals[0] < -3.2)).all()
 
 
-def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(tracker, device):
-    rollout = rewarded(tracker, device, num_terrains=2, replicas=2)
+def test_an_invalid_crossing_has_no_reward_and_an_invalid_stand_ends_it(anymal, device):
+    rollout = rewarded(reward_only(anymal, tracking_lin_vel=1.0), device, num_terrains=2, replicas=2)
 
     def break_one(share):
         step = round(30 * share)  # of 0.6 s

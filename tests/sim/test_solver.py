@@ -1,5 +1,8 @@
-"""Our dynamics and our step find what mujoco_warp's find, from the same state."""
+"""Dynamics and step find what mujoco_warp's find, from the same state; torques, randomisation, errors, recording."""
 
+import gc
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -10,8 +13,12 @@ import warp as wp
 
 from kernels.contact import make_contacts
 from kernels.ground import FIRM, make_ground
+from sim.crossing import GROUND_FRICTION, SolverCfg
+from sim.device import resolve_device
+from sim.simulation import Simulation
 from sim.solver import Dynamics, StockDynamics, make_dynamics
-from tests.sim.scenes import put, standing
+from sim.terrains.bank import TerrainBank
+from tests.sim.scenes import GAINS, Stepper, put, standing
 
 Mujoco: Any = mujoco  # it names its types at run time
 WORLDS, CAPACITY = 16, 24
@@ -94,9 +101,8 @@ def build(xml, device, **parts):
 def make_ours(m, d, contacts):
     """Our dynamics of it, or stock by our road, and whether it is the former."""
     m.opt.run_collision_detection = False  # as Newton has it where it finds the contacts itself
-    found = make_dynamics(
-        m, d, contacts, wp.zeros(WORLDS, dtype=int, device=d.qpos.device), 1 + np.arange(m.ngeom - 1), 0
-    )
+    parked = wp.zeros(WORLDS, dtype=int, device=d.qpos.device)
+    found = make_dynamics(m, d, contacts, parked, 1 + np.arange(m.ngeom - 1), 0)
     m.opt.run_collision_detection = True
     return found
 
@@ -106,9 +112,9 @@ def copy_contacts(d, contacts):
     count = int(d.nacon.numpy()[0])
     indices_by_world = [np.flatnonzero(d.contact.worldid.numpy()[:count] == k) for k in range(WORLDS)]
     assert (d.contact.geom.numpy()[:count, 0] == 0).all()
-    stock = {"shape": d.contact.geom.numpy()[:, 1] - 1, "point": d.contact.pos.numpy(),
-                 "normal": d.contact.frame.numpy()[:, 0], "distance": d.contact.dist.numpy()}  # fmt: skip
-    for name, values in stock.items():
+    shapes, normals = d.contact.geom.numpy()[:, 1] - 1, d.contact.frame.numpy()[:, 0]
+    stock = (shapes, d.contact.pos.numpy(), normals, d.contact.dist.numpy())
+    for name, values in zip(("shape", "point", "normal", "distance"), stock, strict=True):
         copied = np.zeros(getattr(contacts, name).numpy().shape, values.dtype)
         for k, chosen in enumerate(indices_by_world):
             copied[k, : len(chosen)] = values[chosen]
@@ -202,7 +208,7 @@ def test_every_kind_of_constraint(device, arms, height):
 def test_robots_that_fall(eight, monkeypatch):
     """Steps of the robots that searches cross with, in all states of their contacts, against mujoco_warp's.
 
-    The ground is slippery and soft in indices_by_world.
+    The ground is slippery and soft in patches.
     """
     ground, rng = make_ground(8, eight.device), np.random.default_rng(2)
     ground.friction.assign(np.float32(rng.uniform(0.2, 1.0, ground.friction.shape)))
@@ -284,12 +290,8 @@ def test_every_quantity_of_a_step(device):
             for name in ("xpos", "xquat", "cdof", "M", "qfrc_actuator", "qfrc_smooth"):
                 expected[name] = getattr(d, name).numpy().copy()
             com = d.subtree_com.numpy()[:, roots].copy()
-            force, joint_force = d.actuator_force.numpy(), expected["qfrc_actuator"][:, 8]
-            limits = (
-                np.isin(force[:, 0], (-4.0, 5.0)),
-                np.isin(joint_force, (-3.0, 2.0)),
-                np.isclose(abs(force[:, 1]), 0.5),
-            )
+            roll, slide, knee = *d.actuator_force.numpy()[:, :2].T, expected["qfrc_actuator"][:, 8]
+            limits = (np.isin(roll, (-4.0, 5.0)), np.isin(knee, (-3.0, 2.0)), np.isclose(abs(slide), 0.5))
             limited += np.sum(limits, axis=1)
 
             def find_ours(expected=expected, com=com):
@@ -363,3 +365,86 @@ def test_too_many_contacts_are_noted(device, solver):
 def test_other_models_take_their_step(device, parts):
     assert isinstance(make_ours(*build(MODEL, device)), Dynamics)
     assert isinstance(make_ours(*build(MODEL, device, **parts)), StockDynamics)
+
+
+def test_torque_is_the_pd_law_and_clamped(eight, robot):
+    # In the air, at rest, on ANYmal: 80 N m/rad * 0.5 rad = 40 N m; at 5 rad the 80 N m limit. Moving at 3 rad/s:
+    # 40 - 2 * 3 = 34.
+    eight.bank.set_heights(np.zeros(eight.bank.heights.shape, np.float32))
+    kp, kd, limit = map(np.array, GAINS[robot.name])
+    q, qd = standing(robot, 8, z=3.0), np.zeros((8, 18))
+    qd[2, 6:] = 3.0
+    put(eight, q, qd)
+    targets = q.copy()
+    targets[0, 7:] += 0.5
+    targets[1, 7:] -= 5.0
+    targets[2, 7:] += 0.5
+    eight.targets.assign(np.float32(targets))
+    with wp.ScopedDevice(eight.device):
+        eight.physics_step()
+    torque = np.array(eight.joint_torque.numpy())
+    np.testing.assert_allclose(torque[0, 6:], 0.5 * kp, rtol=1e-4)
+    np.testing.assert_allclose(torque[1, 6:], -limit, rtol=1e-4)
+    np.testing.assert_allclose(torque[2, 6:], 0.5 * kp - 3.0 * kd, rtol=1e-3)
+    np.testing.assert_allclose(torque[3, 6:], 0, atol=1e-3)
+    assert not torque[:, :6].any()  # nothing drives the base
+
+
+def test_friction_and_mass_of_each_robot(anymal, device):
+    # Three robots on the same ground: they weigh 47.13, 52.13 and 57.13 kg, and every contact has its robot's friction.
+    bank = TerrainBank(1, device=device)
+    friction, mass = np.array([0.5, 0.9, 1.25]), np.array([-5.0, 0.0, 5.0])
+    sim = Simulation(anymal, bank, np.zeros(3, int), friction=friction, added_base_mass=mass)
+    put(sim, standing(anymal, 3, z=0.6))
+    stepper, forces = Stepper(sim), np.zeros((3, 3))
+    stepper.run(4.0)
+    stepper.run(0.4, lambda: np.add(forces, np.array(sim.geom_force.numpy()).sum(1) / 20, out=forces))
+    np.testing.assert_allclose(forces[:, 2], (52.13 + mass) * 9.81, rtol=0.01)
+    mixed = sim.dynamics.surfaces.friction.numpy()
+    np.testing.assert_allclose(mixed[..., :2] / friction[:, None, None], 1.0, rtol=1e-5)
+    assert friction.min() > GROUND_FRICTION
+
+
+def test_solver_options_arrive(anymal, device):
+    bank = TerrainBank(1, device=device)
+    sim = Simulation(anymal, bank, np.zeros(1, int), cfg=SolverCfg(iterations=7, ls_iterations=13))
+    assert (sim.solver.mjw_model.opt.iterations, sim.solver.mjw_model.opt.ls_iterations) == (7, 13)
+
+
+@pytest.mark.parametrize(
+    ("terrains", "added_base_mass", "field"),
+    [
+        ([0, 2], None, "terrain_of_env"),
+        ([0, 0], np.array([0.0, -60.0]), "added_base_mass"),  # more than the base has
+    ],
+)
+def test_what_cannot_be_simulated_is_named(anymal, device, terrains, added_base_mass, field):
+    with pytest.raises(ValueError, match=field):
+        Simulation(anymal, TerrainBank(2, device=device), np.array(terrains), added_base_mass=added_base_mass)
+
+
+def test_devices():
+    expected, missing = ("cuda:0", "cuda:99") if wp.is_cuda_available() else ("cpu", "cuda")
+    assert (resolve_device("cpu"), resolve_device(None)) == ("cpu", expected)
+    for name in ("tpu", missing):
+        with pytest.raises(ValueError, match=f"device .{name}"):
+            resolve_device(name)
+
+
+def test_no_garbage_is_collected_while_a_graph_is_recorded_and_a_spoilt_one_is_recorded_again(device):
+    # Python collects garbage at any time, and freeing what holds memory of the GPU can spoil a recording.
+    collects = []
+
+    def launch(spoilt=(), error=RuntimeError):
+        collects.append(gc.isenabled())
+        if len(collects) in spoilt:
+            raise error("CUDA graph capture failed.")
+
+    sim = SimpleNamespace(device=device)
+    Simulation.capture(sim, partial(launch, [2]))
+    assert collects == [False] * 3 and gc.isenabled()
+    for spoilt, error in (([5, 6], RuntimeError), ([8], ValueError)):
+        with pytest.raises(error, match="capture failed"):
+            Simulation.capture(sim, partial(launch, spoilt, error))
+        assert gc.isenabled()
+    assert len(collects) == 8

@@ -15,16 +15,14 @@ from sim.mujoco_c.crossing import EpisodeStates, MujocoC, cross_in_mujoco_c, dra
 from sim.mujoco_c.model import GROUND, crossing_model, surface_heights, to_mujoco
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
-from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 from tests.sim.dogs import GAINS, KINDS, urdf, with_mesh, write_dog
 from tests.sim.plain_mujoco import cross_and_keep, rays_from_above
 from tests.sim.policies import Remembers, stand
-from tests.sim.scenes import put, simulate, standing
+from tests.sim.scenes import FLAT, put, simulate, standing
 
 EPISODES = 3
-FLAT = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
 
 
 def test_starts_are_those_of_the_rollout(robot):

@@ -48,7 +48,7 @@ def read_limits(builder):
 
 
 def test_armature_and_limits_are_the_same_in_newton_and_mujoco(robot, c_model, builder):
-    # Gains and limits of effort, by the torques that they make: test_simulation.
+    # Gains and limits of effort, by the torques that they make: tests/sim/test_solver.py.
     np.testing.assert_allclose(builder.joint_armature[6:], c_model.dof_armature[6:])
     limited = c_model.jnt_limited[1:] == 1
     np.testing.assert_allclose(c_model.jnt_range[1:][limited], read_limits(builder)[limited], atol=1e-6)
