@@ -206,13 +206,9 @@ class Training:
             self.learner.resume(saved)
         elif start is not None:
             self.learner.start_from(start)
-        self.progress = TrainingProgress(
-            run_dir,
-            self.learner,
-            cfg.iterations,
-            origin={**provenance(device, cfg.seed), "settings": settings, "processes": ranks.size},
-            saved=saved and saved["progress"],
-        )
+        self._origin = {**provenance(device, cfg.seed), "settings": settings, "processes": ranks.size}
+        progress = saved and saved["progress"]
+        self.progress = TrainingProgress(run_dir, self.learner, cfg.iterations, origin=self._origin, saved=progress)
 
     def before_iteration(self) -> None:
         """Exchanges a mix's terrains when that is due; lets the actor learn after its critic's first iterations."""
@@ -273,7 +269,15 @@ class Training:
         if not learner.ranks.is_first:
             return
         write_checkpoint(self._run_dir / CHECKPOINT, self.state())
-        record = {**self.progress.record(), "averaged": learner.averaged, **self._facts}
+        record = {
+            **self._origin,
+            "robot": self.task.robot.name,
+            "iterations": learner.iteration,
+            "num_envs": learner.env.num_envs,
+            **self.progress.state(),
+            "averaged": learner.averaged,
+            **self._facts,
+        }
         for path in filter(None, (self._run_dir / POLICY, export)):
             write_controller(path, learner, record)
             file = path
@@ -313,7 +317,6 @@ class TrainingProgress:
         """
         self._learner = learner
         self._iterations = iterations
-        self._origin = origin
         self._state = saved or {"env_steps": 0, "wall_s": 0.0, "pieces": [], "curve": []}
         self._state["pieces"].append({**origin, "from_iteration": learner.iteration})
         self._began = time.monotonic() - self._state["wall_s"]
@@ -333,16 +336,6 @@ class TrainingProgress:
     def state(self) -> dict[str, Any]:
         """Plain data for the next piece."""
         return self._state | {"wall_s": round(time.monotonic() - self._began, 1)}
-
-    def record(self) -> dict[str, Any]:
-        """The training record: provenance, totals, the pieces of the training, and the curve."""
-        return {
-            **self._origin,
-            "robot": self._learner.env.task.robot.name,
-            "iterations": self._learner.iteration,
-            "num_envs": self._learner.env.num_envs,
-            **self.state(),
-        }
 
     def finish_row(self) -> None:
         """Make a row of the iterations since the last one, if there are any."""
