@@ -51,9 +51,8 @@ class Frames:
 
     def __getitem__(self, rows: slice | NDArray[Any]) -> Self:
         longest = int(self.num_frames[rows].max(initial=0))
-        values: dict[str, Any] = {
-            name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray | GroundMaps)
-        }
+        arrays = {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray | GroundMaps)}
+        values: dict[str, Any] = {name: array[rows] for name, array in arrays.items()}
         return replace(self, **values | {name: values[name][:, :, :longest] for name in FRAME_ARRAYS})
 
     @staticmethod

@@ -83,15 +83,12 @@ class Recording(Frames):
 
     def result(self) -> RolloutResult:
         """What came of the recorded episodes; positions are those of the last frame, what they took is not known."""
-        last = np.maximum(self.num_frames - 1, 0)[..., None, None]
-        penalties, position = (
-            np.take_along_axis(values, last, axis=2)[:, :, 0] for values in (self.penalties, self.base_position)
-        )
+        ends = (*np.indices(self.num_frames.shape), np.maximum(self.num_frames - 1, 0))
         invalid = (self.outcome == Outcome.INVALID)[..., None]
         return RolloutResult(
-            penalties=np.where(invalid, np.nan, penalties.astype(np.float64)),
+            penalties=np.where(invalid, np.nan, self.penalties[ends].astype(np.float64)),
             penalty_names=self.penalty_names,
-            final_position=position,
+            final_position=self.base_position[ends],
             **{name: getattr(self, name) for name in _EPISODE_ARRAYS},
         )
 
@@ -144,21 +141,17 @@ class RolloutRecorder:
             arrays[name] = array.reshape(*shape, *array.shape[1:])
         bank = self._rollout.sim.bank
         maps = bank.ground_maps()
-        heights: Any = bank.heights[: len(terrains)].numpy()
         frames = Frames(
             **arrays,
             num_frames=self._num_frames.reshape(shape),
-            heights=heights.copy(),  # on the CPU numpy() is a view
+            heights=np.array(bank.heights[: len(terrains)].numpy()),  # on the CPU numpy() is a view
             ground=None if maps is None else maps[: len(terrains)],
         )
         return replace(result, frames=frames)
 
     @np.errstate(over="ignore", invalid="ignore")  # of an episode that broke
     def _add_frames(self, ended: bool) -> None:
-        """Add the present state of every robot on its way, or the last of every episode that ended.
-
-        Where a step broke the state, there is no last one.
-        """
+        """Add the present state of every robot on its way, or the last of each that ended, unless a step broke it."""
         rollout = self._rollout
         episode = rollout.episode.numpy()
         outcome = rollout.outcome.numpy()

@@ -72,10 +72,7 @@ def ground_paint(heights: NDArray[np.floating], ground: GroundMaps | None = None
 def scene_model(
     robot: RobotCfg, heights: NDArray[np.floating], *, width: int, height: int, ground: GroundMaps | None = None
 ) -> Any:
-    """The model of a scene: the robot's file and its height grid [m], shape (nrow, ncol), in world-local coordinates.
-
-    Images are at most of that width and height [pixels].
-    """
+    """The model of a scene of a robot and a height grid [m], shape (nrow, ncol), for images of at most that size."""
     spec = shown_spec(robot)
     for geom in spec.worldbody.geoms:
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
@@ -163,10 +160,7 @@ class Renderer(AbstractContextManager):
         shadows: bool = True,
         ground: GroundMaps | None = None,
     ) -> None:
-        """Build the scene of a height grid [m], shape (nrow, ncol), and open OpenGL for images of this size [pixels].
-
-        Shadows take as long as all the rest in software.
-        """
+        """Build the scene of heights [m], (nrow, ncol), for images of this size [pixels]; shadows double the time."""
         self.model = scene_model(robot, heights, width=width, height=height, ground=ground)
         self._context = open_context(width, height)
         self._robot = robot

@@ -297,8 +297,7 @@ def measure_extents(builder: newton.ModelBuilder, poses: Any) -> Iterator[tuple[
         model, probes = builder.finalize(), make_probes(builder)
         state: Any = model.state()
         counts = np.diff(probes.strip_start.numpy())
-        radius = np.repeat(probes.strip_radius.numpy(), counts)
-        shape = np.repeat(probes.strip_shape.numpy(), counts)
+        radius, shape = (np.repeat(values.numpy(), counts) for values in (probes.strip_radius, probes.strip_shape))
         names = np.array(builder.shape_label)[shape]
         body = np.array(builder.shape_body)[shape]
         points = probes.position.numpy()

@@ -185,12 +185,9 @@ def robot_digest(robot: RobotCfg) -> str:
 
     A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
     """
-    settings = {}
-    for setting in fields(robot):
-        value = getattr(robot, setting.name)
-        default = setting.default if setting.default_factory is MISSING else setting.default_factory()
-        if setting.name not in _NOT_IN_DIGEST and value != default:
-            settings[setting.name] = value
+    defaults = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(robot)}
+    counted = {name: value for name, value in vars(robot).items() if name not in _NOT_IN_DIGEST}
+    settings = {name: value for name, value in counted.items() if value != defaults[name]}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for file in read_model_files(robot.model_file).files:
         digest.update(hashlib.sha256(file.read_bytes()).digest())

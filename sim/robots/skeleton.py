@@ -1,7 +1,4 @@
-"""A robot as MuJoCo reads its file: bodies, shapes, and where recorded joint coordinates put them.
-
-For showing a robot, not for simulating one: forward kinematics and geometry are those of MuJoCo C.
-"""
+"""A robot to look at, as MuJoCo reads its file: bodies, shapes, and where recorded joint coordinates put them."""
 
 from collections import defaultdict
 from collections.abc import Callable

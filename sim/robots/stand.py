@@ -1,7 +1,4 @@
-"""Whether a robot stands, how many contacts it has when it lies, and what its files hold, as text for a terminal.
-
-``templates`` has the sentences.
-"""
+"""Whether a robot stands, how many contacts it has when it lies, and what its files hold, as text of ``templates``."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -109,8 +106,7 @@ class Standing:
     def describe(self) -> str:
         """How the robot stood, and what has to be mended."""
         on_ground = min(self.bottoms.values()) + _NEAR_LOWEST
-        low = [name for name, bottom in self.bottoms.items() if bottom < on_ground]
-        roleless = [name for name in low if name not in self.robot.geom_names]
+        roleless = [name for name, z in self.bottoms.items() if z < on_ground and name not in self.robot.geom_names]
         return _TEMPLATES.get_template("standing.txt").render(standing=self, roleless=roleless).rstrip()
 
 
@@ -202,9 +198,7 @@ def _joint_rows(robot: RobotCfg, sim: Simulation) -> Iterator[Sequence[str]]:
     yield *heads, *("saturation", "speed limit [rad/s]")[: motors.shape[1]]
     drives = read_drives(model)
     driven = model.actuator_trnid[:, 0].tolist()
-    armature, damping, friction = (
-        getattr(model, f"dof_{name}")[6:] for name in ("armature", "damping", "frictionloss")
-    )
+    armature, damping, friction = (getattr(model, f"dof_{key}")[6:] for key in ("armature", "damping", "frictionloss"))
     for k, (name, angle) in enumerate(zip(robot.joint_names, robot.default_joint_pos, strict=True)):
         low, high = model.jnt_range[1 + k]
         span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[1 + k] else "free"
