@@ -144,7 +144,7 @@ class RolloutRecorder:
         frames = Frames(
             **arrays,
             num_frames=self._num_frames.reshape(shape),
-            heights=np.array(bank.heights[: len(terrains)].numpy()),  # on the CPU numpy() is a view
+            heights=np.array(bank.heights[: len(terrains)].numpy(), np.float32),  # on the CPU numpy() is a view
             ground=None if maps is None else maps[: len(terrains)],
         )
         return replace(result, frames=frames)
