@@ -56,16 +56,6 @@ def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *,
     return {"kernel": case.name, **times, "speedup": speedup, "ceiling_share": ceiling_share, "bound_by": bound_by}
 
 
-def print_table(report: dict[str, Any]) -> None:
-    """Prints the rows."""
-    rows = []
-    for row in report["rows"]:
-        times = [format_value(row[name], None, ".4g") for name in ("ours_ms", "torch_ms", "torch_compile_ms")]
-        rows.append((row["kernel"], *times, f"{row['speedup']:.1f}x", f"{row['ceiling_share']:.1%}", row["bound_by"]))
-    title = f"{report['device']}: {report['num_envs']} robots on {report['num_terrains']} terrains"
-    show_table(title, ("kernel", "ours ms", "torch", "compiled", "speed-up", "of ceiling", "bound by"), rows)
-
-
 def file_name(device_name: str) -> str:
     """``nvidia-h200.json`` for an NVIDIA H200, ``cpu.json`` for any CPU."""
     name = "cpu" if device_name.startswith("CPU") else re.sub(r"[^a-z0-9]+", "-", device_name.lower()).strip("-")
@@ -104,7 +94,12 @@ def main(argv: list[str]) -> None:
     rows = [measure_kernel(case, ceiling, device, timing, compiled=not args.small) for case in cases]
     sizes = {"num_envs": num_envs, "num_terrains": num_terrains}
     report = {**origin, "small": args.small, "robot": robot.name, **sizes, "rows": rows}
-    print_table(report)
+    lines = []
+    for row in rows:
+        times = [format_value(row[name], None, ".4g") for name in ("ours_ms", "torch_ms", "torch_compile_ms")]
+        lines.append((row["kernel"], *times, f"{row['speedup']:.1f}x", f"{row['ceiling_share']:.1%}", row["bound_by"]))
+    title = f"{origin['device']}: {num_envs} robots on {num_terrains} terrains"
+    show_table(title, ("kernel", "ours ms", "torch", "compiled", "speed-up", "of ceiling", "bound by"), lines)
     write_atomically(out, to_json(report))
     print(f"Written to {out}.")
 

@@ -43,16 +43,13 @@ def node_heights(heights: Tensor, terrain_of_env: Tensor, row: Tensor, col: Tens
     return heights[terrain, row.clamp(0, heights.shape[1] - 1), col.clamp(0, heights.shape[2] - 1)]
 
 
-_CORNERS = (0, 0), (0, 1), (1, 0), (1, 1)  # of a cell: row and column
-
-
 def surface(heights: Tensor, terrain_of_env: Tensor, spacing: float, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
     """Height [m] of the triangulated surface at points (E, N), and its slopes along x and y there."""
     u, v = x / spacing, y / spacing
     col, row = u.floor(), v.floor()
     fx, fy = u - col, v - row
     row, col = row.long(), col.long()
-    h00, h10, h01, h11 = (node_heights(heights, terrain_of_env, row + i, col + j) for i, j in _CORNERS)
+    h00, h10, h01, h11 = (node_heights(heights, terrain_of_env, row + k // 2, col + k % 2) for k in range(4))
     low_x, low_y, high_x, high_y = h10 - h00, h01 - h00, h11 - h01, h11 - h10
     # Of both triangles, since a compiler that asks twice which it is may round otherwise the second time.
     low = fx + fy < 1.0
@@ -100,8 +97,7 @@ def observation(
     return torch.cat(row, dim=1).clamp_(-columns.OBSERVATION_LIMIT, columns.OBSERVATION_LIMIT)
 
 
-PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")
-"""Columns of :func:`penalties`."""
+PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble", "collision")  # columns of :func:`penalties`
 
 
 def penalties(

@@ -59,18 +59,13 @@ def test_the_scan_is_clipped_at_a_metre_and_a_wild_state_gives_a_bounded_row():
     assert np.abs(rows[2]).max() == 100
 
 
-def act(action, num_joints=2, scale=0.5):
-    action = np.float32(action)
-    last = wp.zeros((len(action), num_joints), dtype=float)
-    targets = wp.full((len(action), 7 + num_joints), 9.0, dtype=float)
-    apply_action(wp.array(action), make_sensors(num_joints, []), scale, last, targets)
-    return last.numpy(), targets.numpy()
-
-
 def test_action_by_hand():
     # Default pose (-0.5, 0.5), half a radian per unit; actions are clipped at 100, and what is not finite is no limit.
-    last, targets = act([[0.2, -1], [300, -300], [np.nan, np.inf]])
-    np.testing.assert_array_equal(last, np.float32([[0.2, -1], [100, -100], [np.nan, np.nan]]))
+    action, last = wp.array(np.float32([[0.2, -1], [300, -300], [np.nan, np.inf]])), wp.zeros((3, 2), dtype=float)
+    columns = wp.full((3, 9), 9.0, dtype=float)
+    apply_action(action, make_sensors(2, []), 0.5, last, columns)
+    targets = columns.numpy()
+    np.testing.assert_array_equal(last.numpy(), np.float32([[0.2, -1], [100, -100], [np.nan, np.nan]]))
     np.testing.assert_allclose(targets[:, 7:], [[-0.4, 0], [49.5, -49.5], [np.nan, np.nan]], atol=1e-6)
     assert (targets[:, :7] == 9).all()  # the base's columns are not targets
 

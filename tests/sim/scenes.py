@@ -1,6 +1,7 @@
 """Ground to stand on and bodies to drop on it, for the physics tests."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -80,16 +81,14 @@ class Stepper:
                 sim.physics_step()
             sim.read_geom_forces()
 
-        self._sim = sim
-        self._graph = sim.capture(launch)
-        self._steps = steps
+        self.sim, self.steps = sim, steps
+        self.graph = sim.capture(launch)
 
-    def run(self, duration_s: float, each: object = None) -> None:
+    def run(self, duration_s: float, each: Callable[[], object] = lambda: None) -> None:
         """Let the time pass; ``each()`` is called after every launch of the graph."""
-        for _ in range(round(duration_s / (PHYSICS_DT * self._steps))):
-            self._sim.launch(self._graph)
-            if callable(each):
-                each()
+        for _ in range(round(duration_s / (PHYSICS_DT * self.steps))):
+            self.sim.launch(self.graph)
+            each()
 
 
 def positions(sim: Simulation) -> np.ndarray:
