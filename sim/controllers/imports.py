@@ -6,9 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from sim.controllers.formats.deployments import Mjlab, RlSar, UnitreeRlGym, Weights
-from sim.controllers.formats.isaac_lab import IsaacLab
-from sim.controllers.formats.source import Source
+from sim.controllers.formats.sources import IsaacLab, Mjlab, RlSar, Source, UnitreeRlGym, Weights
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file

@@ -25,6 +25,7 @@ from sim.robots.robot import RobotCfg, robot_digest
 _EXPECTED = "expected a .toml, .pt, .ts or .onnx file, module:callable or module:adapter@file (docs/controllers.md)"
 PolicySpec = str | Path | Policy
 """A controller as :func:`load_policy` takes it, or as a callable."""
+_print_once = functools.cache(print)
 
 
 def prepare_torch(device: str) -> None:
@@ -95,12 +96,8 @@ def _warn_if_trained_otherwise(policy: Path, robot: RobotCfg) -> None:
     now = robot_digest(get_robot(robot.spec))  # a command may have changed its time step or capacities by itself
     if trained != now:
         what = f"a robot of other settings, model or meshes (SHA-256 {trained[:12]} in {record.name})"
-        _print_once(f"warning: {policy} was trained with {what} than {robot.spec} has now ({now[:12]})")
-
-
-@functools.cache
-def _print_once(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+        line = f"warning: {policy} was trained with {what} than {robot.spec} has now ({now[:12]})"
+        _print_once(line, file=sys.stderr, flush=True)
 
 
 def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:

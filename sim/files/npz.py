@@ -44,9 +44,7 @@ def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Sequen
         if name not in arrays:
             continue
         got = arrays[name].shape
-        for size, length in zip(shape, got, strict=False):
-            if isinstance(size, str):
-                sizes.setdefault(size, length)
+        sizes = {size: length for size, length in zip(shape, got, strict=False) if isinstance(size, str)} | sizes
         expected = tuple(sizes.get(size, size) for size in shape)
         if got != expected:
             raise ValueError(f"{name} must have shape {expected}, got {got}")

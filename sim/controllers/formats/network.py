@@ -37,7 +37,14 @@ def load_network(
     except ValueError as error:
         raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back") from error
     except Exception as error:  # a stream of pickle opcodes can fail with anything
-        return _load_script(path, device, sizes, error)
+        try:
+            module, probe = (torch.jit.load(str(path), map_location=target).eval() for target in (device, "cpu"))
+        except Exception as foreign:
+            what = "is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module"
+            why = f"(truncated, foreign, or holding code): {in_one_line(error)}"
+            remedy = "give one of these, or an ONNX file that ends in .onnx"
+            raise ValueError(f"policy '{path}' {what} {why}: {remedy}") from foreign
+        return module if sizes is None else _separate_robots(module, probe, path, sizes[0], device)
     policy = make_actor(content, path, activation)
     if sizes is not None and policy.sizes != sizes:
         what = f"maps {policy.sizes[0]} observations to {policy.sizes[1]} actions"
@@ -55,18 +62,6 @@ def find_widths(network: Any) -> tuple[int | None, int | None]:
         with suppress(Exception):  # of an inner layer
             return weight.shape[1], network(torch.zeros(1, weight.shape[1], device=weight.device)).shape[1]
     return None, None
-
-
-def _load_script(path: Path, device: str, sizes: tuple[int, int] | None, reason: Exception) -> Policy:
-    """A TorchScript module from a file that is no checkpoint, for this reason; C++ reads it."""
-    try:
-        module, probe = (torch.jit.load(str(path), map_location=target).eval() for target in (device, "cpu"))
-    except Exception as error:
-        what = "is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module"
-        why = f"(truncated, foreign, or holding code): {in_one_line(reason)}"
-        remedy = "give one of these, or an ONNX file that ends in .onnx"
-        raise ValueError(f"policy '{path}' {what} {why}: {remedy}") from error
-    return module if sizes is None else _separate_robots(module, probe, path, sizes[0], device)
 
 
 class _Script(torch.nn.Module):

@@ -35,21 +35,15 @@ class MlpPolicy(nn.Module):
         super().__init__()
         self.activation = activation
         weights = {key.removeprefix("mlp."): value for key, value in state.items() if key.startswith("mlp.")}
-        layers: list[nn.Module] = []
-        for index in sorted(int(key.removesuffix(".weight")) for key in weights if key.endswith(".weight")):
-            size, width = weights[f"{index}.weight"].shape
-            layers += [nn.Linear(width, size), ACTIVATIONS[activation]()]
+        indices = sorted(int(key.removesuffix(".weight")) for key in weights if key.endswith(".weight"))
+        shapes = [weights[f"{index}.weight"].shape for index in indices]
+        layers = [layer for size, width in shapes for layer in (nn.Linear(width, size), ACTIVATIONS[activation]())]
         self.layers = nn.Sequential(*layers[:-1])
+        self.sizes = shapes[0][1], shapes[-1][0]
         self.layers.load_state_dict(weights)
         self.mean = nn.Buffer(state.get("obs_normalizer._mean", torch.zeros(1)).float())
         self.std = nn.Buffer(state.get("obs_normalizer._std", torch.ones(1)).float())
         self.normalised = "obs_normalizer._mean" in state
-
-    @property
-    def sizes(self) -> tuple[int, int]:
-        """Observation and action size."""
-        linear = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
-        return linear[0].in_features, linear[-1].out_features
 
     def normalise(self, observation: torch.Tensor) -> torch.Tensor:
         """Observation rows as the layers see them."""

@@ -10,7 +10,7 @@ import warp as wp
 from rsl_rl.models import RNNModel
 from tensordict import TensorDict
 
-from sim.controllers.adapters import read_row
+from sim.controllers.described import read_row
 from sim.controllers.formats.onnx import export_onnx
 from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.loaders import load_policy, prepare_torch

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.image import imsave
 
 from kernels.episode import Outcome
-from sim.controllers.adapters import read_row
+from sim.controllers.described import read_row
 from sim.crossing import resolved
 from sim.mujoco_c.crossing import cross_in_mujoco_c, draw_starts
 from sim.robots.compiled import robot_spec
