@@ -210,6 +210,11 @@ class Described(torch.nn.Module):
             self._refuse("history must say how steps are laid out: {length = 1, newest, by, fill}")
         if history is not None and history.by == "row" and len(set(self.lengths)) > 1:
             self._refuse(f'history.by must be "term" where terms have other lengths, got {self.lengths}')
+        self.observation_size = int(np.dot(self.widths, self.lengths))
+        """Columns that the network sees."""
+        terms = zip(cfg.observation, self.widths, self.lengths, strict=True)
+        self.columns = ", ".join(f"{term.term} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms)
+        """What the network sees, as text."""
         self.use(None, torch.device("cpu"))
 
     def use(self, network: Any, device: torch.device) -> None:
@@ -276,17 +281,6 @@ class Described(torch.nn.Module):
             remedy = f"write into robot.toml scan_x = {x} and scan_y = {y}"
             self._refuse(f"the scan's points are not those of the robot: {remedy}")
         return [index_by_point[point] for point in points]
-
-    @property
-    def observation_size(self) -> int:
-        """Columns that the network sees."""
-        return int(np.dot(self.widths, self.lengths))
-
-    @property
-    def columns(self) -> str:
-        """What the network sees, as text."""
-        terms = zip(self.cfg.observation, self.widths, self.lengths, strict=True)
-        return ", ".join(f"{term.term} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms)
 
     @property
     def graph_safe(self) -> bool:
