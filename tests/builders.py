@@ -1,6 +1,7 @@
 """Small things that tests of several rooms are made of: archives, terrains and controllers."""
 
 import socket
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -10,11 +11,16 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from kernels.super_gaussian import LOWER, UPPER
+from qd.evaluate.measures import Performance, measure
+from qd.evaluate.sets import TerrainSet, plain_set
+from qd.evaluate.tables import Tables, make_tables
 from qd.search.archive import Archive, FreshValues, no_outcomes, write_archive
 from qd.search.fitness import Evaluation
 from sim.files.atomic import to_json
+from sim.robots.find import get_robot
 from sim.robots.robot import ROBOTS, robot_identity
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.qd.stand_in import BAD, GOAL, HIT, LATE, result_of
 
 OBSERVATIONS, ACTIONS = 235, 12
 
@@ -108,6 +114,27 @@ def judged_archive() -> Archive:
             [[never, half], [[14, 0, 0, 6], never], [half, never], [never, never], [much, much]]
         ),
     )
+
+
+def make_set(count: int, first: int = 0) -> TerrainSet:
+    """A set of hard-random terrains that are numbered from ``first`` on."""
+    return replace(plain_set("hard_random", count, 0), numbers=np.arange(first, first + count))
+
+
+def make_measured(goals: Sequence[int], *, of: int = 20, reward: float = 10.0, bad: Sequence[int] = ()) -> Performance:
+    """A controller that reached the goal in so many of ``of`` episodes of each terrain; ``bad`` ones are invalid."""
+    rows = [[GOAL] * count + [HIT if count % 2 else LATE] * (of - count) for count in goals]
+    for terrain in bad:
+        rows[terrain] = [BAD] * of
+    return measure(result_of(rows, reward=np.full((len(goals), of), reward)), (1.0, 1.0))
+
+
+def make_report(goals: Mapping[str, Mapping[str, Sequence[int]]], *, of: int = 4) -> Tables:
+    """Tables of ANYmal: set -> controller -> on each terrain, in how many of ``of`` episodes it reached the goal."""
+    crossed = {name: {who: make_measured(counts, of=of) for who, counts in row.items()} for name, row in goals.items()}
+    sets = {name: make_set(len(next(iter(row.values())))) for name, row in goals.items()}
+    controllers = {who: {"policy": who, "sha256": None} for who in next(iter(goals.values()))}
+    return make_tables(crossed, sets, get_robot("anymal"), controllers=controllers, episodes=of, seed=0)
 
 
 def write_run(folder: Path, archive: Archive, settings: dict | None = None) -> Path:

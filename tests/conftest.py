@@ -22,6 +22,7 @@ from qd.workers import crosser
 from sim.device import resolve_device
 from sim.files.command import publish
 from sim.files.provenance import provenance
+from sim.recording.renderer import open_context
 from sim.robots.find import get_robot
 from sim.robots.robot import ROBOTS
 from sim.simulation import Simulation
@@ -88,6 +89,15 @@ def stand_ins():
 def device() -> str:
     """Warp device of this run: FAULTLINE_DEVICE, or the CPU."""
     return resolve_device(DEVICE)
+
+
+@pytest.fixture(scope="session")
+def opengl() -> None:
+    """Skips what needs pictures where there is no OpenGL."""
+    try:
+        open_context(16, 16).free()
+    except ValueError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

@@ -49,20 +49,19 @@ def begun(robot: RobotCfg, cfg: FinetuneCfg, run: Path) -> Training:
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)
 
 
+def layers(*sizes, between=torch.nn.ELU):
+    """Linear layers of these sizes, and what is between them."""
+    parts = [part for pair in itertools.pairwise(sizes) for part in (torch.nn.Linear(*pair), between())]
+    return torch.nn.Sequential(*parts[:-1])
+
+
 def write_actor(path, *, hidden=(16, 8), critic=False, critic_hidden=None, **extra):
     """A controller of random layers, as rsl_rl writes it."""
     torch.manual_seed(0)
-
-    def layers(*sizes):
-        state = {}
-        for k, (width, out) in enumerate(itertools.pairwise(sizes)):
-            state |= {f"mlp.{2 * k}.weight": 0.05 * torch.randn(out, width), f"mlp.{2 * k}.bias": torch.zeros(out)}
-        return state
-
-    actor = {STD: torch.full((12,), 0.3), **layers(235, *hidden, 12), **extra}
+    actor = {STD: torch.full((12,), 0.3), **layers(235, *hidden, 12).state_dict(prefix="mlp."), **extra}
     content = {"actor_state_dict": actor, "activation": "elu"}
     if critic:
-        content["critic_state_dict"] = layers(235, *(critic_hidden or hidden), 1)
+        content["critic_state_dict"] = layers(235, *(critic_hidden or hidden), 1).state_dict(prefix="mlp.")
     torch.save(content, path)
     return path
 

@@ -1,4 +1,4 @@
-"""Fine-tuning: what it starts from, which terrains it trains on and exchanges, what it leaves, and how it goes on."""
+"""Fine-tuning: what it starts from, which terrains it trains on, what it leaves, how it goes on; described ones."""
 
 import json
 from dataclasses import fields, replace
@@ -9,15 +9,20 @@ import pytest
 import torch
 
 from qd.evaluate.sets import hash_elites, read_trained_on, split_elites
+from qd.faults.searches import controllers_in
 from qd.search.archive import write_archive
+from sim.controllers.described import read_controller
 from sim.controllers.loaders import load_policy
 from sim.controllers.spec import controller_hash
 from sim.files.command import run_command
+from sim.mujoco_c.crossing import cross_in_mujoco_c, draw_starts
 from sim.robots.find import get_robot
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces import registry as spaces
 from tests.builders import fresh_values, make_archive, write_run
+from tests.sim.dogs import write_toml
 from tests.sim.terrains.spaces.spaces import write_ridges
-from tests.train.conftest import PPO, begun, write_actor
+from tests.train.conftest import PPO, begun, layers, write_actor
 from train.cfg import FinetuneCfg, RunCfg
 from train.commands import FinetuneCommand
 from train.finetune import find_training_elites, finetune, train_specialist
@@ -52,10 +57,6 @@ def cfg_of(places, **changes):
 
 def actor_of(path):
     return torch.load(path, weights_only=True)["actor_state_dict"]
-
-
-def record_of(run):
-    return json.loads((run / "policy.train.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +126,7 @@ def test_the_controller_is_the_mean_of_the_last_actors(places):
     cfg, run = cfg_of(places, iterations=2, critic_iterations=0, ppo=replace(PPO, average=0.5)), places / "mean"
     for iterations, averaged in ((2, 1), (6, 3)):  # in a longer training the last half are others
         finetune(ROBOT, replace(cfg, iterations=iterations), run, ON_CPU)
-        assert record_of(run)["averaged"] == averaged
+        assert json.loads((run / "policy.train.json").read_text())["averaged"] == averaged
     last, mean = (actor_of(run / name)["mlp.0.bias"] for name in ("checkpoint.pt", "policy.pt"))
     assert 0 < (last - mean).abs().max() < 0.01  # a training goes on from the last
 
@@ -300,3 +301,84 @@ def test_errors_come_before_any_work(flags, field, places, monkeypatch, capsys):
     assert run_command(FinetuneCommand, given, name="finetune") == 2
     assert field in capsys.readouterr().err.splitlines()[-1]
     assert not (places / "runs").exists()
+
+
+TERMS = """observation = [
+  {term = "ang_vel", scale = 0.25, clip = 4.0}, {term = "gravity"}, {term = "joint_pos", clip = [-1.0, 2.0]},
+  {term = "last_action"}, {term = "clock", period_s = 0.5},
+]
+history = {length = 3, newest = "last", by = "term", fill = "first"}
+action_scale = [0.2, 0.3, 0.2, 0.3]
+action_clip = 2.0
+action_delay_steps = 1
+joints = ["HR_knee", "FL_hip", "FL_knee", "FR_hip"]
+"""
+COLUMNS = 3 * (3 + 3 + 4 + 4 + 2)
+
+
+@pytest.fixture(scope="module")
+def dog(tmp_path_factory):
+    """The dog with a described controller beside it, whose network is TorchScript."""
+    torch.manual_seed(0)
+    file = write_toml(tmp_path_factory.mktemp("described") / "dog")
+    torch.jit.script(layers(COLUMNS, 16, 8, 4, between=torch.nn.SiLU)).save(file.with_name("net.pt"))
+    file.with_name("controller.toml").write_text(f'policy = "net.pt"\n{TERMS}')
+    return get_robot(str(file))
+
+
+def dog_cfg(dog, **changes):
+    values = {"mix": "hard-random", "num_envs": 6, "terrains": 4, "iterations": 1, "ppo": PPO}
+    return replace(FinetuneCfg.of(dog), **values | changes)
+
+
+def test_the_actor_begins_as_the_controller(dog, tmp_path):
+    tuned = begun(dog, dog_cfg(dog), tmp_path)
+    policy, env, alg = load_policy(dog.policy_file, dog, "cpu"), tuned.learner.env, tuned.learner.alg
+    assert alg.get_policy().state_dict()[STD].tolist() == pytest.approx([0.3] * 4)
+    observations, ends, done = env.get_observations(), 0, []
+    step = env.task.step
+    env.task.step = lambda action: (done.append(action.clone()), step(action))
+    with torch.inference_mode():
+        for k in range(60):
+            policy.reset(env.task.episode_steps == 0)
+            expected = policy(env.task.observation.clone())
+            if k == 30:
+                env.task.episode_steps[:3] = env.task.max_episode_steps - 1  # these end; the others go on
+            observations, _, dones, _ = env.step(alg.actor(observations))
+            torch.testing.assert_close(done[-1], expected, rtol=1e-5, atol=1e-5)
+            ends += int(dones.sum())
+    assert ends >= 3 and np.unique(torch.stack(done).numpy()).size > 100
+
+
+def test_it_learns_goes_on_and_crosses(dog, tmp_path, capsys):
+    run, on_cpu = tmp_path / "run", RunCfg(device="cpu", export=tmp_path / "panel" / "mine.pt")
+    for iterations in (2, 3):
+        described = finetune(dog, dog_cfg(dog, iterations=iterations), run, on_cpu)
+    assert f"written to {described} and" in capsys.readouterr().out
+    assert described == run / "controller.toml" and read_checkpoint(run / "checkpoint.pt")["iter"] == 3
+    assert read_controller(described) == replace(
+        read_controller(dog.policy_file), policy="policy.pt", activation="swish"
+    )
+    assert controllers_in(tmp_path / "panel") == {"mine": str(tmp_path / "panel" / "mine.toml")}
+    start, after, copy = (load_policy(path, dog, "cpu") for path in
+                          (dog.policy_file, described, tmp_path / "panel" / "mine.toml"))  # fmt: skip
+    rows = torch.randn(5, COLUMNS)
+    assert 1e-6 < (after.network(rows) - start.network(rows)).abs().max() < 0.1
+    torch.testing.assert_close(copy.network(rows), after.network(rows))
+    flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    brief = replace(dog, max_duration_s=0.2)
+    assert not cross_in_mujoco_c(brief, after, flat, draw_starts(brief, flat, 2, 3, "cpu")).invalid.any()
+    (tmp_path / "further").mkdir()
+    # As a hardening does: with its critic.
+    further = begun(dog, dog_cfg(dog, policy=str(run / "checkpoint.pt")), tmp_path / "further")
+    expected = read_checkpoint(run / "checkpoint.pt")["critic_state_dict"]
+    assert all(value.equal(expected[key]) for key, value in further.learner.alg.critic.state_dict().items())
+    assert further.learner.env.controller.activation == "swish"
+
+
+def test_other_networks_are_refused(dog, tmp_path):
+    limited = torch.nn.Sequential(torch.nn.Hardtanh(-9.0, 9.0), *layers(COLUMNS, 16, 8, 4))
+    torch.jit.script(limited).save(tmp_path / "limited.pt")
+    (tmp_path / "controller.toml").write_text(f'policy = "limited.pt"\n{TERMS}')
+    with pytest.raises(ValueError, match="finetune needs a network of plain layers"):
+        read_start(tmp_path / "controller.toml", dog)

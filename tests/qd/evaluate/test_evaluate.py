@@ -1,4 +1,4 @@
-"""Evaluations from end to end over made-up crossings, and what is refused before any work."""
+"""Evaluations over made-up crossings: tables, rates, packs, and what is refused before any work."""
 
 import hashlib
 import json
@@ -11,14 +11,34 @@ from qd.commands import EvaluateCommand
 from qd.evaluate import evaluate as evaluation
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
+from qd.evaluate.pack import (
+    HEIGHT_UNIT_M,
+    add_rates,
+    choose_terrains,
+    count_failing,
+    evaluate_pack,
+    find_pack,
+    make_pack,
+    passes,
+    read_pack,
+    round_heights,
+    summarise_rates,
+    write_terrains,
+)
 from qd.evaluate.sets import split_elites
 from qd.evaluate.tables import is_regression
-from qd.search.archive import write_archive
+from qd.faults.judge import judge
+from qd.faults.minimise import minimise
+from qd.faults.searches import find_search
+from qd.search.archive import read_archive, write_archive
+from sim.controllers.spec import controller_identity
 from sim.files.command import run_command
+from sim.robots.robot import ROBOTS
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from tests.builders import make_archive
-from tests.qd.robots import Robots
+from tests.qd.robots import OTHER, Robots, bump_stops
 from tests.qd.searches import crossing_by
-from tests.qd.stand_in import PENALTIES, compute_by
+from tests.qd.stand_in import BAD, GOAL, HIT, LATE, PENALTIES, compute_by, result_of
 from tests.train.conftest import write_trained
 
 STAND, STRETCH = "tests.sim.policies:stand", "tests.sim.policies:stretch"
@@ -132,3 +152,152 @@ def test_a_regression_is_a_goal_rate_below_that_of_before(archive, worse, status
         assert run_command(EvaluateCommand, [*flags, "--device", "cpu"], name="evaluate") == status
     report = json.loads(Path("runs/anymal-tables/compared.json").read_text())
     assert list(report["controllers"]) == ["old", "new"] and list(report["goal"]) == ["elites"]
+
+
+def fails(cfg, heights, seeds):
+    """C-G crosses everything, others nothing but terrains whose highest point is below .2 m."""
+    return (np.abs(heights).max(axis=(1, 2)) >= 0.2) & ("C-G" not in cfg.policy)
+
+
+def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=0.0):
+    return {
+        "name": f"elite-{elite}", "elite": elite, "kind": kind, "verdict": "fault" if fault else "near-fault",
+        "family": family, "cause": cause, "searched": {"goal_rate": rate},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("candidates", "expected"),
+    [
+        ([candidate(0, fault=False, rate=0.0), candidate(1, rate=0.4)], [1, 0]),  # faults first
+        ([candidate(0), candidate(1), candidate(2, family=1, rate=0.4)], [0, 2, 1]),  # one family before two
+        ([candidate(0), candidate(1, family=1), candidate(2, family=2, cause="drop", rate=0.4)], [0, 2, 1]),  # causes
+        ([candidate(0), candidate(1, family=1), candidate(2, family=2, kind="minimal", rate=0.4)], [0, 2, 1]),  # kinds
+        ([candidate(0, rate=0.4), candidate(1, family=1, rate=0.1)], [1, 0]),  # the lowest goal rate
+    ],
+)
+def test_what_comes_next(candidates, expected):
+    for size in (9, 1):  # each beginning of a pack is one
+        assert choose_terrains(candidates, size) == expected[:size]
+
+
+def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robots, base = Robots(fails), {"base": str(anymal.policy_file)}
+
+    def make(controllers, **changes):
+        return make_pack(find_search(path), controllers, compute=compute_by(robots), out=Path("pack"), **changes)
+
+    compute = compute_by(Robots(bump_stops))
+    judge(path, stages=("resolved",), compute=compute)
+    with pytest.raises(ValueError, match="judge"):  # nobody else crossed them
+        make(base)
+    judge(path, stages=("others",), certifiers=OTHER, compute=compute)
+    minimise(path, elite=" ".join(map(str, elites)), judged=True, certifiers=OTHER, compute=compute)
+    assert not Path("pack").exists() and not robots.opened
+
+    content, archive = make(base | OTHER), read_archive(path)
+    assert json.loads(Path("pack/pack.json").read_text()) == json.loads(json.dumps(content))
+    assert {"command", "commit", "sources_sha256", "device", "versions", "seed", "date"} <= content.keys()
+    verdicts = [entry["verdict"] for entry in content["terrains"]]
+    minimal = [entry for entry in content["terrains"] if entry["kind"] == "minimal"]
+    faults = int((archive.confirmed & archive.certified).sum())
+    assert verdicts == sorted(verdicts) and verdicts.count("fault") == faults + 2
+    assert len(minimal) == 2 and all(entry["parts"] == [4] and entry["cause"] == "rise" for entry in minimal)
+    for entry in content["terrains"]:
+        assert entry["searched"]["goal_rate"] < 0.75 and entry["certificates"][0]["controller"] == "C-G"
+        assert entry["rates"]["C-G"]["goal_rate"] == 1.0 and entry["rates"]["base"]["valid_episodes"] == 20
+    assert (content["searched"], content["certifiers"]) == ("base", ["C-G"])
+    rates = [entry["rates"]["base"]["goal_rate"] for entry in content["terrains"]]
+    assert content["rates"]["base"]["failing"] == sum(rate < 0.5 for rate in rates)
+    few = make(OTHER, size=3)  # the first of the same; the searched controller is always among those that cross
+    assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
+    assert [entry["name"] for entry in few["terrains"]] == [entry["name"] for entry in content["terrains"][:3]]
+    assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
+
+
+@pytest.fixture
+def pack(tmp_path, anymal, monkeypatch):
+    """Three terrains: random heights of both signs, flat ground, and a step of 0.5 m."""
+    monkeypatch.chdir(tmp_path)
+    heights = np.zeros((3, NUM_ROWS, NUM_COLS))
+    heights[0] = np.random.default_rng(0).uniform(-4.0, 4.0, heights[0].shape)
+    heights[2, :, 150:] = 0.5
+    Path("pack").mkdir()
+    chosen = [candidate(3), candidate(7, fault=False), candidate(9, family=1, cause="drop")]
+    entries = add_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
+    genes = np.array([np.full(64, entry["elite"] / 100) for entry in chosen], np.float32)
+    content = controller_identity(anymal, anymal.policy_file) | {"seed": 0, "episodes": 4, "searched": "base"}
+    content |= {"terrains": entries, "rates": {"base": summarise_rates(entries, "base", 0)}}
+    content["terrains_sha256"] = write_terrains(Path("pack"), round_heights(heights), genes)
+    Path("pack/pack.json").write_text(json.dumps(content))
+    return heights
+
+
+def test_a_pack_is_read_as_it_was_written(pack):
+    stored = read_pack(find_pack("pack"))
+    assert len(stored.terrains) == 3 and stored.terrains[1]["verdict"] == "near-fault"
+    np.testing.assert_array_equal(stored.heights, round_heights(pack))
+    assert np.abs(stored.heights - pack).max() <= HEIGHT_UNIT_M / 2 + 1e-6
+    assert stored.genes[:, 0].tolist() == pytest.approx([0.03, 0.07, 0.09])
+    assert find_pack("anymal") == ROBOTS["anymal"].pack and len(read_pack(find_pack("cassie")).terrains) == 100
+    with pytest.raises(FileNotFoundError, match="dog"):
+        find_pack("dog")
+
+
+@pytest.mark.parametrize("damage", ["npz", "other", "key"])
+def test_a_damaged_pack_is_refused(pack, damage):
+    file, content = Path("pack/pack.npz"), json.loads(Path("pack/pack.json").read_text())
+    if damage == "other":  # of another making
+        write_terrains(Path("pack"), round_heights(pack[::-1]), np.zeros((3, 64), np.float32))
+    elif damage == "key":
+        del content["rates"]
+        Path("pack/pack.json").write_text(json.dumps(content))
+    else:
+        file.write_bytes(file.read_bytes()[:-9])
+    with pytest.raises(ValueError, match="pack"):
+        read_pack(Path("pack"))
+
+
+def test_rates_over_a_pack_are_means_with_families_drawn_together():
+    chosen = [candidate(elite, family=family) for elite, family in enumerate((0, 0, 1))]
+    entries = add_rates(chosen, {"this": result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]])})
+    rates = summarise_rates(entries, "this", 0)
+    assert rates["goal_rate"] == pytest.approx(2 / 3) and rates["success_rate"] == pytest.approx((1 + 1 + 0.5) / 3)
+    assert (rates["failing"], rates["terrains"], rates["failing_families"], rates["families"]) == (1, 3, 1, 2)
+    assert rates["goal_interval"] == [0.0, 1.0]  # two families: a quarter of the resamples each has one alone
+    assert count_failing(entries, "this", "cause") == {"ridge": {"terrains": 3, "failing": 1}}
+    # An invalid terrain is in no rate.
+    entries = add_rates(chosen, {"this": result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4])})
+    rates = summarise_rates(entries, "this", 0)
+    assert entries[1]["rates"]["this"]["goal_rate"] is None
+    assert (rates["goal_rate"], rates["terrains"], rates["failing"]) == (0.5, 2, 1)
+
+
+def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
+    robots = Robots(fails)
+    sizes = {"compute": compute_by(robots), "episodes": 2}
+    stored = read_pack(Path("pack"))
+    report = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **sizes)
+    (file,) = Path("runs").glob("anymal-*-pack.json")
+    assert json.loads(file.read_text()) == json.loads(json.dumps(report))
+    # It fails the first terrain, which is 4 m high, and crosses the flat one.
+    assert [entry["rates"]["this"]["goal_rate"] for entry in report["terrains"]] == [0.0, 1.0]
+    assert (report["rates"]["failing"], report["rates"]["terrains"]) == (1, 2)
+    assert report["beside"]["base"]["goal_rate"] == 0.5 and report["pack"]["terrains"] == 3
+    assert [report["by"]["verdict"][value]["failing"] for value in ("fault", "near-fault")] == [1, 0]
+    shown = capsys.readouterr().out
+    assert "1 of 2" in shown and "ridge" in shown
+    assert not robots.opened[0].reward and robots.opened[0].engine == "search"
+    whole = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **sizes)
+    assert whole["rates"]["terrains"] == 3
+
+
+@pytest.mark.parametrize(("least", "status"), [(0.34, 0), (0.35, 1)])
+def test_ci_fails_where_the_goal_rate_may_be_lower(pack, capsys, least, status):
+    flags = ["--pack", "pack", "--policy", OTHER["C-G"], "--device", "cpu", "--fail-under", str(least)]
+    with crossing_by(Robots(fails)):
+        assert run_command(EvaluateCommand, flags, name="evaluate") == status
+    # All of two families: Wilson's interval begins at 2 / (2 + 1.96^2) = .342.
+    assert "0.342" in (out := capsys.readouterr().out) and f"{least:.3f}" in out
+    assert not passes({"rates": {"goal_interval": None}}, 0.1)  # one family says nothing of its spread

@@ -15,12 +15,10 @@ from qd.show.crossed import find_failure_time, find_typical_episode, make_title
 from qd.show.film import Shot, as_gif, follow, interpolate_pose
 from sim.files.command import run_command
 from sim.mujoco_c.model import surface_heights
-from sim.recording.renderer import open_context
 from tests.builders import small_archive, write_run
 from tests.qd.recordings import recording_of, stand_in_cross
 
 SCALES = {"yaw_rate": 2.0, "vel_x": 1.0}
-FRAMES = 251
 LATE = Outcome.TIME_OUT
 
 
@@ -30,13 +28,9 @@ def recording():
     sums = np.zeros((5, 6))
     sums[:, :2] = [[1, 1], [9, 9], [3, 3], [2, 6], [5, 5]]
     outcomes, fallen = [LATE, Outcome.GOAL, LATE, LATE, Outcome.BASE_COLLISION], [False] * 4 + [True]
-    made = recording_of(outcomes, [6.0] * 5, penalties=sums, fallen=fallen, frames=FRAMES)
+    made = recording_of(outcomes, [6.0] * 5, penalties=sums, fallen=fallen, frames=251)
     made.base_position[..., 1:] = 4.0, 0.6
     return replace(made, heights=np.zeros((1, 161, 321), np.float32))
-
-
-def shot_of(recording, episode=4):
-    return Shot(recording=recording, episode=episode)
 
 
 def test_the_typical_episode_ends_like_most_and_costs_the_middle(recording):
@@ -84,15 +78,15 @@ def test_the_title_names_the_commonest_ending(recording):
 
 def test_a_film_begins_three_seconds_before_the_failure_slows_down_and_ends_one_after(recording):
     # Of an end at 5 s: 2 to 4 s, then 4 to 5 s in 4 s, then 1 s in which the last frame is held.
-    times = shot_of(recording).times(10)
+    times = Shot(recording=recording, episode=4).times(10)
     np.testing.assert_allclose(times[[0, 20, 40, 60, 70]], [2.0, 4.0, 4.5, 5.0, 6.0])
     assert len(times) == 71
-    whole = shot_of(recording).times(10, whole=True)
+    whole = Shot(recording=recording, episode=4).times(10, whole=True)
     np.testing.assert_allclose(whole[[0, 40, 60, 80, 90]], [0.0, 4.0, 4.5, 5.0, 6.0])
-    arrives = shot_of(recording, 1).times(10)
+    arrives = Shot(recording=recording, episode=1).times(10)
     np.testing.assert_allclose(arrives, np.arange(61) / 10)  # all of it, at its speed
     short = replace(recording, num_frames=np.full((1, 5), 26, np.int32))
-    np.testing.assert_allclose(shot_of(short).times(10)[[0, 20, 30]], [0.0, 0.5, 1.5])
+    np.testing.assert_allclose(Shot(recording=short, episode=4).times(10)[[0, 20, 30]], [0.0, 0.5, 1.5])
 
 
 def test_poses_lie_between_those_recorded():
@@ -105,12 +99,12 @@ def test_poses_lie_between_those_recorded():
 
 def test_the_camera_follows_and_rises_where_the_ground_would_hide_the_robot(recording):
     times = np.linspace(0.0, 6.0, 61)
-    level = follow(shot_of(recording), times, 3.0)
+    level = follow(Shot(recording=recording, episode=4), times, 3.0)
     assert len(level) == 61 and level[0].elevation == level[-1].elevation == -22.0
     xs = np.array([camera.target[0] for camera in level])
     assert (np.diff(xs) >= 0).all() and 2.0 <= xs[0] < 2.2 and 5.8 < xs[-1] <= 6.0
     recording.heights[0, :60] = 1.6  # a wall on the camera's side
-    camera = follow(shot_of(recording), times, 3.0)[20]
+    camera = follow(Shot(recording=recording, episode=4), times, 3.0)[20]
     assert camera.elevation < -22.0
     azimuth, tilt = np.deg2rad(camera.azimuth), np.deg2rad(camera.elevation)
     away = -np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
@@ -140,14 +134,6 @@ def run(tmp_path, monkeypatch):
 
 def film(*argv):
     return run_command(FilmCommand, [*argv, "--device", "cpu", "--no-shadows"], name="film")
-
-
-@pytest.fixture
-def opengl():
-    try:
-        open_context(16, 16).free()
-    except ValueError as error:
-        pytest.skip(str(error))
 
 
 def test_films_of_elites_and_of_a_map(run, opengl, capsys):

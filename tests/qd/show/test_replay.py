@@ -1,4 +1,4 @@
-"""Terrains again: numbers by hand, drawings, files, and which terrains a command line names."""
+"""Terrains again: numbers, drawings, recordings and files of them, and which terrains a command line names."""
 
 import dataclasses
 import json
@@ -17,16 +17,20 @@ from qd.search.directory import RunDirectory
 from qd.show.commands import ExportCommand, ReplayCommand
 from qd.show.crossed import draw_crossing
 from qd.show.elites import OpenedRun, open_run
-from qd.show.recordings import Recordings
+from qd.show.export import export_controller, export_elites, export_pack
+from qd.show.recordings import Recordings, request_elite
 from qd.show.replay import compute_numbers, describe, replay, source_from_map, source_from_run
 from qd.show.view.viewed import open_viewed_run
 from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.command import run_command
 from sim.robots.robot import robot_identity
-from tests.builders import fresh_values, small_archive
-from tests.qd.recordings import FRAMES, recording_of
+from sim.terrains.bank import make_heights
+from sim.terrains.maps.heightmap import as_terrain, read_heightmap
+from sim.terrains.spaces.registry import get_space
+from sim.terrains.terrains import GroundMaps, Terrains
+from tests.builders import fresh_values, small_archive, write_run
+from tests.qd.recordings import FRAMES, make_run, minimal_of, recording_of, stand_in_cross
 from tests.qd.searches import CFG
-from tests.qd.show.report.pages import make_run, minimal_of
 
 STAND = "tests.sim.policies:stand"
 
@@ -223,3 +227,127 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
     assert about["elite"] == number and about["minimal"]["cause"]["kind"] == "rise"
     show = open_viewed_run(run, minimal=str(number), policies=("base=shipped",))
     assert show.elite == number and show.minimal
+
+
+@pytest.fixture
+def request_4(anymal):
+    return request_elite(small_archive(5), 4, policy=str(anymal.policy_file), replicas=2)
+
+
+@pytest.fixture
+def crossed(request_4):
+    return stand_in_cross([])([request_4], lambda share: None)[0]
+
+
+def test_only_the_recording_of_an_equal_request_is_read(anymal, request_4, crossed, tmp_path):
+    assert Recordings(anymal, folder=tmp_path).read(request_4) is None
+    Recordings(anymal, folder=tmp_path).store(request_4, crossed)
+    again = Recordings(anymal, folder=tmp_path)
+    named = again.read(dataclasses.replace(request_4, label="a hill"))
+    np.testing.assert_array_equal(named.base_position, crossed.base_position)
+    assert named.labels == ("a hill",)
+    terrain = request_4.terrain
+    heights = Terrains(heights=np.zeros((1, 161, 321), np.float32), seeds=terrain.seeds)
+    terrains = [
+        dataclasses.replace(terrain, seeds=terrain.seeds + 1), dataclasses.replace(terrain, genes=-terrain.genes),
+        dataclasses.replace(terrain, space=get_space("course")), heights,
+        dataclasses.replace(heights, ground=GroundMaps.plain(1)),
+    ]  # fmt: skip
+    changes = [{"replicas": 1}, {"policy": __file__}, *({"terrain": changed} for changed in terrains)]
+    changed = [dataclasses.replace(request_4, **change) for change in changes]
+    assert len({request_4, *changed}) == 8  # no two requests are equal
+    assert [again.read(request) for request in changed] == [None] * 7
+    assert Recordings(anymal, device="cuda:0", folder=tmp_path).read(request_4) is None  # whose last bits are others
+    other = dataclasses.replace(anymal, action_scale=anymal.action_scale * 2)
+    assert Recordings(other, folder=tmp_path).read(request_4) is None
+    (file,) = tmp_path.iterdir()
+    file.write_bytes(file.read_bytes()[:-9])  # damaged, it counts as none and is written again
+    assert again.read(request_4) is None
+    again.store(request_4, crossed)
+    assert again.read(request_4) is not None
+
+
+def test_missing_recordings_are_crossed_in_lots_of_one_controller(anymal, tmp_path, monkeypatch):
+    archive = small_archive(5)
+    policies = (str(anymal.policy_file), __file__)
+    requests = [request_elite(archive, k, policy=policies[k % 2], replicas=4) for k in range(5)]
+    lots = []
+
+    def cross(lot, progress):
+        lots.append([request.label for request in lot])
+        return stand_in_cross([])(lot, progress)
+
+    def record(device, requests):
+        recordings = Recordings(anymal, device=device, folder=tmp_path).record(requests)
+        return [recording.labels[0] for recording in recordings]
+
+    monkeypatch.setattr("qd.show.recordings.RecordingCrosser", lambda robot, device: cross)
+    labels = [f"elite {k} of anymal" for k in range(5)]
+    assert record("cuda:0", requests) == labels and lots == [labels[::2], labels[1::2]]
+    more = [*requests[3:], request_elite(archive, 0, policy=policies[0], replicas=4, seed=1)]
+    assert record("cuda:0", more) == [*labels[3:], labels[0]] and lots[2:] == [labels[:1]]
+    record("cpu", requests)  # one at a time, controller by controller
+    assert lots[3:] == [[labels[k]] for k in (0, 2, 4, 1, 3)]
+
+
+@pytest.fixture
+def run():
+    """The newest run: three elites, with what fresh episodes say."""
+    archive = small_archive(3)
+    fresh = dataclasses.replace(fresh_values(archive), goal_rate=np.array([0.1, 0.2, 0.9]))
+    return write_run(Path("runs/anymal-small-0"), dataclasses.replace(archive, fresh=fresh))
+
+
+def export(elite, **options):
+    return export_elites(open_run("anymal"), elite, **options)
+
+
+def test_elites_are_exported_as_the_simulation_has_them(run):
+    archive = open_run("anymal", run).archive
+    files, folder, elites = export("2 1 0"), run / "terrains", (2, 1, 0)
+    endings = ("npz", "png", "npy", "xml", "stl", "glb", "sdf", "json")
+    expected = [*(f"elite-{k}.{ending}" for k in elites for ending in endings), "README.md", "index.json"]
+    assert [path.name for path in files] == expected and sorted(expected) == sorted(p.name for p in folder.iterdir())
+    for elite in elites:
+        heights = make_heights(archive.genes[elite : elite + 1])[0]
+        np.testing.assert_array_equal(as_terrain(read_heightmap(folder / f"elite-{elite}.npz")), heights)
+        np.testing.assert_array_equal(np.load(folder / f"elite-{elite}.npz")["genes"], archive.genes[elite])
+        about = json.loads((folder / f"elite-{elite}.json").read_text())
+        read = as_terrain(read_heightmap(folder / f"elite-{elite}.png"))
+        np.testing.assert_allclose(read, heights, rtol=0, atol=0.51 * about["scale_m"] + 1e-7)
+        assert (about["elite"], about["robot"]) == (elite, "anymal")
+        assert about["fitness"] == archive.fitness[elite] and about["fresh"]["episodes"] == 40
+        assert about["ratios"] == dict(zip(archive.penalties, archive.ratios[elite].tolist(), strict=True))
+        assert {"command", "commit", "versions", "date", "run", "space"} <= about.keys() and "seed" not in about
+        assert about["verdict"] == ("not failing" if elite == 2 else "failing")
+        assert (about["cause"] is None) == (about["ending"] == "crossed") == (elite == 2)
+        assert about["in_words"].startswith("crossed, 36 of 40" if elite == 2 else f"{about['cause']}: ")
+    index = json.loads((folder / "index.json").read_text())
+    assert [(row["elite"], row["files"]) for row in index["elites"]] == [(k, f"elite-{k}") for k in elites]
+
+
+def test_files_of_an_earlier_export_are_replaced_only_if_that_is_asked_for(run):
+    (file, _, _, readme, index) = export("0", formats=("npz", "xml"), out=Path("out"))
+    assert file == Path("out/elite-0.npz")
+    assert "--mjcf=elite-0.xml" in readme.read_text()
+    file.write_bytes(b"mine")
+    (index.unlink(), readme.unlink())
+    with pytest.raises(ValueError, match="overwrite"):
+        export("0", formats=("npz",), out=Path("out"))
+    assert file.read_bytes() == b"mine"
+    export("0", formats=("npz",), out=Path("out"), overwrite=True)
+    assert file.read_bytes() != b"mine"
+
+
+def test_a_pack_is_exported_with_what_it_knows(tmp_path):
+    (*_, about, _, _) = export_pack("anymal", "3", formats=("xml",), out=tmp_path)
+    content = json.loads(about.read_text())
+    assert content["verdict"] == "fault" and content["start"][:2] == [2, 4] and content["pack"] == "pack"
+
+
+def test_a_controller_is_not_replaced_silently(anymal, tmp_path):
+    out = tmp_path / "mine.onnx"
+    out.write_bytes(b"mine")
+    with pytest.raises(ValueError, match="overwrite"):
+        export_controller(None, anymal, out)
+    assert out.read_bytes() == b"mine"

@@ -8,13 +8,17 @@ import pytest
 
 from kernels.episode import Outcome
 from sim.crossing import CrossingCfg
+from sim.mujoco_c.model import surface_heights
 from sim.recording.frames import FRAME_ARRAYS
 from sim.recording.recorder import Recording, RolloutRecorder, make_recording, read_recording, write_recording
+from sim.recording.renderer import Camera, Renderer, ground_paint, scene_model
 from sim.rollout import Rollout
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
-from tests.sim.plain_mujoco import to_c
+from tests.sim.plain_mujoco import rays_from_above, to_c
 from tests.sim.scenes import FLAT, slope, spike
+from tests.sim.scenes import standing as standing_robots
 
 SHORT = CrossingCfg(poll_every_s=0.5)
 SEEDS = np.array([5, 6], np.uint32)
@@ -151,3 +155,87 @@ def test_what_is_no_recording_is_refused(recording, tmp_path):
             read_recording(path)
     with pytest.raises(FileNotFoundError):
         read_recording(tmp_path / "elsewhere.npz")
+
+
+SIZE = (640, 320)
+
+
+@pytest.fixture(scope="module")
+def ground():
+    """A hill at x 9..12, y 6..7.5 and a pit at x 3..6, y 0.5..2: no turn or mirror image of it is the same."""
+    heights = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
+    heights[120:151, 180:241] = 0.6
+    heights[10:41, 60:121] = -0.6
+    return heights
+
+
+def standing(robot, x, y, z):
+    return to_c(standing_robots(robot, 1, x, y, z + robot.default_base_height)[0])
+
+
+def test_paint_tells_heights_and_metres_apart(ground):
+    paint = ground_paint(ground).astype(int)
+    assert paint.shape == (640, 1280, 3)
+
+    hill, pit, level, line, flank = paint[[536, 96, 360, 360, 536], [840, 360, 120, 560, 720]]  # 80 pixels a metre
+    assert hill[0] - hill[2] > 60 and pit[2] - pit[0] > 60 and np.ptp(level) < 25
+    assert line.sum() < 0.9 * level.sum()  # the line at 7 m
+    assert (flank < 0.95 * hill).all()  # the hill's flank, a cell wide
+
+
+def test_the_ground_of_a_scene_is_the_simulations(anymal):
+    rough = np.random.default_rng(1).uniform(-0.4, 0.4, (NUM_ROWS, NUM_COLS))
+    model = scene_model(anymal, rough, width=64, height=64)
+    points = np.random.default_rng(2).uniform([-1.9, -1.9], [12.9, 9.9], (200, 2))
+    points = points[np.hypot(*(points - [2, 4]).T) > 1.5]  # there stands the robot
+    hidden = np.array([1, 0, 0, 0, 0, 0], np.uint8)  # of the groups, the ground's alone
+    heights, _ = rays_from_above(model, points, standing(anymal, 2, 4, 0.5), hidden)
+    np.testing.assert_allclose(heights, surface_heights(rough, *points.T), atol=1e-5)
+
+
+def pixel_of(camera, x, y, height=0.0):
+    """Row and column of a point in a picture taken straight from above, x to the right and y up."""
+    focal = SIZE[1] / 2 / np.tan(np.deg2rad(45.0) / 2)  # MuJoCo's vertical angle of view
+    depth = camera.distance + camera.target[2] - height
+    row, column = -focal * (y - camera.target[1]) / depth, focal * (x - camera.target[0]) / depth
+    return round(SIZE[1] / 2 + row), round(SIZE[0] / 2 + column)
+
+
+def test_seen_from_above_everything_is_where_it_is(opengl, anymal, ground):
+    above = Camera(target=(8.0, 4.0, 0.0), distance=20.0, azimuth=90.0, elevation=-90.0)
+    with Renderer(anymal, ground, width=SIZE[0], height=SIZE[1], shadows=False) as renderer:
+        picture = renderer.render(standing(anymal, 2.5, 3.5, 0.0), above).astype(int)
+        other = renderer.render(standing(anymal, 13.5, 2.5, 0.0), above).astype(int)
+    assert picture.shape == (320, 640, 3)
+    hill = picture[pixel_of(above, 10.5, 6.7, 0.6)]
+    pit = picture[pixel_of(above, 4.5, 1.3, -0.6)]
+    assert hill[0] - hill[2] > 40 and pit[2] - pit[0] > 40
+    for x, y in [(4.5, 6.7), (10.5, 1.3), (1.5, 4.5)]:  # where mirror images of them would be
+        level = picture[pixel_of(above, x, y)]
+        assert abs(level[0] - level[2]) < 30
+    goal = picture[pixel_of(above, 14.3, 4.2)]
+    assert goal[1] > goal[0] + 20 and goal[1] > goal[2]
+    base = picture[pixel_of(above, 2.5, 3.5, 0.6)]
+    assert base.sum() < 320 < other[pixel_of(above, 2.5, 3.5)].sum()
+
+
+def test_ghosts_forces_and_touches_have_colours(opengl, anymal, ground):
+    side = Camera(target=(2.0, 4.0, 0.5), distance=4.0, azimuth=90.0, elevation=-10.0)
+    pose = standing(anymal, 2.0, 4.0, 0.0)
+    ghost = {"ghost": standing(anymal, 3.2, 4.0, 0.0), "ghost_name": "C-G"}
+    force, base, foot = np.zeros((4, 3)), np.zeros(13, bool), np.zeros(13, bool)
+    force[0, 2], base[0], foot[-4:] = 900.0, True, True
+    with Renderer(anymal, ground, width=SIZE[0], height=SIZE[1], shadows=False) as renderer:
+        pictures = [
+            renderer.render(pose, side, **marks).astype(int)
+            for marks in ({}, ghost, {"foot_force": force}, {"touching": base}, {"touching": foot}, {})
+        ]
+    alone, joined, pushed, hit, stepping, again = pictures
+    np.testing.assert_array_equal(alone, again)  # what was added to a picture stays in it
+
+    def pixels(picture, strong, weak):
+        return (picture[..., strong].min(axis=-1) - picture[..., weak].max(axis=-1) > 60).sum()
+
+    seen = (joined, [1, 2], [0]), (pushed, [0], [1, 2]), (hit, [0], [1]), (stepping, [0, 1], [2])
+    for picture, strong, weak in seen:
+        assert pixels(picture, strong, weak) > pixels(alone, strong, weak) + 40

@@ -123,22 +123,12 @@ def test_a_robot_of_many_joints_rests_on_the_ground_by_mujoco_warps_step(tmp_pat
     assert positions(sim)[0, 2] == pytest.approx(0.05, abs=2e-3)
 
 
-def tilt_between(*rows):
-    """Angle [deg] between the base's up vectors of two rows of joint coordinates."""
-    up = [oracle.rotation_matrix(row[3:7])[:, 2] for row in rows]
-    return np.degrees(np.arccos(np.clip(up[0] @ up[1], -1, 1)))
-
-
-def inclines():
-    """Level ground, and slopes of 5, 8 and 9.4 degrees to several sides."""
-    return np.stack([slope(np.radians(a), np.radians(b)) for a in (0, 5) for b in (0, -8, 5, 8)])
-
-
 def test_contact_forces_are_what_changes_the_momentum(eight, robot):
     # Whatever a robot does, landing, sliding or going over: the ground's impulse less that of its weight is the change
     # of its momentum. Forces are those at the beginning of a step, so it is not exact.
     stepper = Stepper(eight, steps=1)  # makes steps of its own
-    eight.bank.set_heights(inclines())
+    # Level ground, and slopes of 5, 8 and 9.4 degrees to several sides.
+    eight.bank.set_heights(np.stack([slope(np.radians(a), np.radians(b)) for a in (0, 5) for b in (0, -8, 5, 8)]))
     q, qd = standing(robot), np.zeros(eight.joint_qd.shape)
     q[:, 2] += 0.08
     qd[:, :3] = np.random.default_rng(0).uniform(-0.5, 0.5, (8, 3))
@@ -181,5 +171,6 @@ def test_slopes_equal_mujocos_tilted_plane(eight, robot, duration_s, metres, deg
         expected = plain_mujoco.run(plain_mujoco.on_plane(robot, plain_mujoco.to_c(start)[3:7]), start, duration_s)
         assert np.linalg.norm(expected[7:] - start[7:]) > 0.05  # it is no free fall
         assert np.linalg.norm(row[:3] - expected[:3]) < metres
-        assert tilt_between(row, expected) < degrees
+        up, expected_up = (oracle.rotation_matrix(joints[3:7])[:, 2] for joints in (row, expected))
+        assert np.degrees(np.arccos(np.clip(up @ expected_up, -1, 1))) < degrees
         np.testing.assert_allclose(row[7:], expected[7:], atol=radians)

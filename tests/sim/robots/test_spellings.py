@@ -38,17 +38,9 @@ def saved():
     return spec.to_xml()
 
 
-def backwards():
-    """Drives in another order than the joints, each with gains of its own."""
-    lines = [DRIVE.format(name).replace('kp="60"', f'kp="{40 + 5 * k}"') for k, name in enumerate(JOINTS)]
-    return mjcf(drive="{0}").replace("".join(JOINTS), "".join(reversed(lines)))
-
-
-def in_frames():
-    legs = re.search(r'<body name="FL_thigh".*</body>\s*(?=<body name="FR_thigh")', PLAIN, re.S)
-    return PLAIN.replace(legs[0], f'<frame pos="0.01 0 0" euler="0 0.1 0">{legs[0]}</frame>')
-
-
+# Drives in another order than the joints, each with gains of its own.
+BACKWARDS = [DRIVE.format(name).replace('kp="60"', f'kp="{40 + 5 * k}"') for k, name in enumerate(JOINTS)][::-1]
+LEG = re.search(r'<body name="FL_thigh".*</body>\s*(?=<body name="FR_thigh")', PLAIN, re.S)[0]
 SPELLINGS = {
     "plain": PLAIN,
     "defaults that are called main": swap(("<default>\n", '<default class="main">\n')),
@@ -60,7 +52,7 @@ SPELLINGS = {
                                                              'armature="0.3"/>')),
     "springs and friction": swap(('armature="0.01"', 'armature="0.01" stiffness="9" springref="0.2" damping="0.7" '
                                                      'frictionloss="0.4"')),
-    "frames": in_frames(),
+    "frames": PLAIN.replace(LEG, f'<frame pos="0.01 0 0" euler="0 0.1 0">{LEG}</frame>'),
     "gravity of the moon": swap(("<default>\n", '<option gravity="0 0 -1.62"/><default>\n')),
     "saved by MuJoCo": saved(),
     "dampratio": drives('<position name="{0}" joint="{0}" kp="60" dampratio="0.8" forcerange="-30 30"/>'),
@@ -68,7 +60,7 @@ SPELLINGS = {
                                  'forcelimited="false"/>'),
     "weak drives": drives('<position name="{0}" joint="{0}" kp="60" kv="2" forcerange="-3 3"/>'),
     "ranges of targets": drives('<position name="{0}" joint="{0}" kp="60" kv="2" ctrlrange="-1.25 0.65"/>'),
-    "drives backwards": backwards(),
+    "drives backwards": drives("{0}").replace("".join(JOINTS), "".join(BACKWARDS)),
     "degrees": swap(('angle="radian"', 'angle="degree"'), ('range="-1.5 2.5"', 'range="-86 143"'),
                     ('range="-2.6 -0.1"', 'range="-149 -5.7"')),
     "another solver": swap(("<default>\n", '<option cone="pyramidal" integrator="RK4" timestep="0.01" tolerance="1"/>'

@@ -47,11 +47,8 @@ def test_a_file_is_a_robot(tmp_path, monkeypatch):
     assert get_robot("link.py") == pickle.loads(pickle.dumps(dog)) == dog
 
 
-HOME = " ".join(["0 0 .3 1 0 0 0", *["0.6 -1.2"] * 4])
-
-
 def test_what_a_robot_toml_leaves_out_is_what_a_user_would_write(tmp_path):
-    keys = f'<keyframe><key name="home" qpos="{HOME}"/></keyframe></mujoco>'
+    keys = f'<keyframe><key name="home" qpos="0 0 .3 1 0 0 0{4 * " 0.6 -1.2"}"/></keyframe></mujoco>'
     file = write_toml(tmp_path / "dog", model=mjcf().replace("</mujoco>", keys))
     dog, written = get_robot(str(file)), get_robot(str(write_dog(tmp_path / "py")))
     for name in ("name", "joint_names", "default_joint_pos", "base_geoms", "foot_geoms", "collision_bit", "spec"):

@@ -1,4 +1,4 @@
-"""The report's page from end to end, on small archives with made-up crossings: whole, true to its files, shut off."""
+"""The report's page from end to end over made-up crossings, and figures of a search, by hand."""
 
 import base64
 import dataclasses
@@ -6,6 +6,7 @@ import io
 import json
 import re
 
+import matplotlib.image
 import numpy as np
 import pytest
 from PIL import Image
@@ -14,6 +15,7 @@ from kernels.episode import Outcome
 from qd.faults.families import VERDICTS, rank, summarise_search
 from qd.search.archive import read_archive, write_archive
 from qd.show.elites import open_run
+from qd.show.figures import draw_archive, draw_curves, relief, write_figures
 from qd.show.report.evaluation import compare_controllers
 from qd.show.report.page import TILE, choose_moments, draw_sheet, percent
 from qd.show.report.report import count_causes, write_report
@@ -21,9 +23,8 @@ from sim.controllers.spec import controller_hash
 from sim.files.atomic import to_json
 from sim.robots.robot import robot_identity
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.qd.evaluate.made import make_report
-from tests.qd.recordings import recording_of
-from tests.qd.show.report.pages import grouped_archive, make_run, minimal_of, reporter, text_of
+from tests.builders import fresh_values, make_report, small_archive
+from tests.qd.recordings import grouped_archive, make_run, minimal_of, recording_of, reporter, rows, text_of
 
 SOURCE = r"data:image/webp;base64,([A-Za-z0-9+/=]+)"
 
@@ -269,9 +270,8 @@ def test_the_page_has_the_numbers_of_the_rounds(tmp_path):
     assert f"faultline report --run {tmp_path}/search-base " in text  # a command that works, wherever the run lies
     assert f"Made from {tmp_path.name}:" in text
     assert "report --robot anymal --run" in text_of(write_report(run, robot="anymal").read_bytes())
-    written(
-        run, rounds=[round_of("base", None)], tables={**hardening()["tables"], "differences": {}}
-    )  # one search alone
+    one_search = {"rounds": [round_of("base", None)], "tables": {**hardening()["tables"], "differences": {}}}
+    written(run, **one_search)
     assert "search-0: base" not in text_of(write_report(run).read_bytes())
 
 
@@ -281,3 +281,48 @@ def test_what_is_no_hardening_is_refused(tmp_path):
     for changes in ({"rounds": []}, {"rounds": [{"controller": 3}]}, {"tables": {"episodes": 20}}):
         with pytest.raises(ValueError, match="rounds"):
             write_report(written(tmp_path, **changes))
+
+
+def test_curves_show_what_the_metrics_say():
+    metrics = rows(4)
+    figure = draw_curves(small_archive(), metrics)
+    left, middle, right, *_ = figure.axes
+    assert left.lines[0].get_xydata().tolist() == [[1, 20], [2, 40], [3, 60], [4, 80]]
+    assert middle.lines[0].get_ydata().tolist() == [5, 10, 15, 20]
+    assert right.lines[0].get_ydata().tolist() == [2, 3, 4, 5]
+    # two ratios have 10 reachable cells, so the right-hand scale is ten times the left-hand one
+    figure.draw_without_rendering()
+    (coverage,) = middle.child_axes
+    assert coverage.get_ylim()[1] == pytest.approx(10 * middle.get_ylim()[1])
+
+
+def test_archive_figure_has_a_line_an_elite_and_the_worst_on_top():
+    archive = small_archive(4)
+    (lines,) = draw_archive(archive).axes[0].collections
+    np.testing.assert_array_equal([line[:, 1] for line in lines.get_segments()], archive.ratios[::-1])
+    assert lines.get_array().tolist() == archive.fitness[::-1].tolist()
+    # with fresh values those that are valid, in their order
+    ratios = np.array([[0.1, 0.9], [0.2, 0.8], [0.3, 0.7], [0.4, 0.6]])
+    fresh = dataclasses.replace(fresh_values(archive), ratios=ratios, invalid_episodes=np.array([0, 40, 0, 0]))
+    (lines,) = draw_archive(dataclasses.replace(archive, fresh=fresh)).axes[0].collections
+    assert np.allclose(lines.get_array(), archive.fitness[[3, 2, 0]] / 2)
+    assert np.allclose([line[:, 1] for line in lines.get_segments()], ratios[[3, 2, 0]])
+
+
+@pytest.mark.parametrize("num_elites", [0, 1])
+def test_figures_are_files_for_archives_of_any_size(tmp_path, num_elites):
+    files = write_figures(tmp_path, small_archive(num_elites), rows(1))
+    assert [file.name for file in files] == ["curves.png", "archive.png"]
+    assert all(matplotlib.image.imread(file).std() > 0.01 for file in files)  # something is drawn
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_relief_is_blue_below_the_start_and_brown_above_with_start_and_goal(every):
+    heights = np.zeros((161, 321), np.float32)
+    heights[:, 100:160], heights[:, 160:220] = -0.4, 0.4
+    pixels = relief(heights[::every, ::every])
+    low, high = (pixels[40 // every, column // every].astype(int) for column in (130, 190))
+    assert low[2] > low[0] and high[0] > high[2]
+    # start at (2, 4) m and goal at (14, 4) m, nodes 0.05 m apart
+    assert pixels[80 // every, 40 // every].tolist() == [240, 200, 60]
+    assert pixels[80 // every, 280 // every].tolist() == [0, 158, 115]
