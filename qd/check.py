@@ -122,13 +122,13 @@ def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:
     return replace(standing, robot=larger)
 
 
-def walk(crosser: Crosser, policy: str) -> dict[str, dict[str, float]]:
+def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
     """How a controller walks over flat ground here, ``searched``, and in MuJoCo C, ``mujoco_c``, at the same steps.
 
     Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` from the start to the end
     [m/s], and ``height`` of the base at the end [m].
     """
-    flat = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([0]))
+    flat = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([seed]))
     engines: dict[str, Engine] = {"searched": "search", "mujoco_c": "mujoco_c_search"}
     walks = {}
     for name, engine in engines.items():
