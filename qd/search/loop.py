@@ -5,6 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from qd.check import ensure_ready
 from qd.search.archive import Archive
 from qd.search.directory import Metrics, RunDirectory, claimed
@@ -142,10 +145,11 @@ def _run_iterations(
     num_groups = cfg.scheduler.num_groups
     last = find_last_iteration(cfg, metrics, until)
 
-    def ask(group: int, iteration: int) -> None:
-        """Puts a group's next terrains into the pipeline."""
+    def ask(group: int, iteration: int) -> NDArray[np.float32]:
         settles = last - cfg.scheduler.settling < iteration <= last
-        genes = scheduler.ask(group, new=not settles)  # after the last iteration too: more would begin with new ones
+        return scheduler.ask(group, new=not settles)  # after the last iteration too: more would begin with new ones
+
+    def put(genes: NDArray[np.float32], group: int, iteration: int) -> None:
         if iteration <= last:
             seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.group_rows(group)]
             pipeline.put(Terrains(genes=genes, seeds=seeds[: len(genes)], space=space))
@@ -153,7 +157,7 @@ def _run_iterations(
     pipeline.clear()
     began = time.perf_counter()
     for group in range(num_groups):
-        ask(group, len(metrics) + 1)
+        put(ask(group, len(metrics) + 1), group, len(metrics) + 1)
     while (iteration := len(metrics) + 1) <= last:
         results, evaluations = [], []
         num_new, search_s = 0, 0.0
@@ -163,8 +167,9 @@ def _run_iterations(
             evaluations.append(evaluate_rollout(results[-1], cfg.cells, cfg.fitness))
             emitters_began = time.perf_counter()
             num_new += scheduler.tell(evaluations[-1], iteration, group)
-            ask(group, iteration + 1)
+            genes = ask(group, iteration + 1)
             search_s += time.perf_counter() - emitters_began
+            put(genes, group, iteration + 1)
         archive = build_archive(cfg, scheduler, iteration)
         row = describe_metrics(archive, RolloutResult.join(results), join_evaluations(evaluations))
         wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
