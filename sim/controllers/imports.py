@@ -6,7 +6,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from sim.controllers.formats.sources import IsaacLab, Mjlab, RlSar, Source, UnitreeRlGym, Weights
+from sim.controllers.formats.isaac_lab import IsaacLab
+from sim.controllers.formats.mjlab import Mjlab
+from sim.controllers.formats.rl_sar import RlSar
+from sim.controllers.formats.source import Source
+from sim.controllers.formats.unitree_rl_gym import UnitreeRlGym
+from sim.controllers.formats.weights import Weights
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file

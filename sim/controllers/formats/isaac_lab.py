@@ -1,0 +1,182 @@
+"""A run of Isaac Lab: its env.yaml and agent.yaml."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.controllers.formats.rsl_rl import read_activation
+from sim.controllers.formats.source import Source, collapse, make_term
+from sim.files.settings import read_yaml
+from sim.robots.compiled import PER_JOINT
+from sim.robots.robot import RobotCfg
+from sim.robots.user import per_joint
+
+_ISAAC_LAB_TERMS = {
+    "base_lin_vel": "lin_vel",
+    "base_ang_vel": "ang_vel",
+    "projected_gravity": "gravity",
+    "generated_commands": "command",
+    "joint_pos_rel": "joint_pos",
+    "joint_vel_rel": "joint_vel",
+    "last_action": "last_action",
+    "height_scan": "scan",
+    "gait_phase": "clock",
+}
+_IDEAL_DRIVE = {"saturation_effort": 1e6, "velocity_limit": 1e6}  # stands beside joints with a DC motor
+
+
+class IsaacLab:
+    """Reads env.yaml and agent.yaml of a run."""
+
+    label = "a run of Isaac Lab (a folder with params/env.yaml)"
+
+    def matches(self, path: Path) -> bool:
+        """Whether it is a folder with params/env.yaml."""
+        return (path / "params" / "env.yaml").is_file()
+
+    def read(self, path: Path, source: Source) -> Path:
+        """Settings of env.yaml and agent.yaml; returns the exported network, else the last checkpoint."""
+        source.file = path / "params" / "env.yaml"
+        env = read_yaml(source.file)
+        articulation = env["scene"]["robot"]
+        pose = articulation["init_state"]["joint_pos"]
+        pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
+        source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
+        _read_actuators(articulation["actuators"], source)
+        source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
+        commands = [command for command in (env.get("commands") or {}).values() if isinstance(command, dict)]
+        ranges = [command.get("ranges") or {} for command in commands]
+        speed = next((limits["lin_vel_x"][1] for limits in ranges if "lin_vel_x" in limits), 0.0)
+        if 0.0 < speed < RobotCfg.speed:
+            source.set(speed=speed, reason=f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here")
+            source.set(max_duration_s=round(15.0 / speed, 1), reason="in proportion")
+        joint_order = _read_action(env["actions"], path, source)
+        group = env["observations"]["policy"]
+        terms = {name: term for name, term in group.items() if isinstance(term, dict)}
+        common = group.get("history_length")
+        lengths = [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
+        rows = [_read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
+        source.set_history(rows, lengths)
+        reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
+        source.set(observation=rows, reason=reason)
+        agent_file = path / "params" / "agent.yaml"
+        agent = read_yaml(agent_file) if agent_file.is_file() else {}
+        if agent.get("clip_actions") is not None:
+            source.set(action_clip=agent["clip_actions"])
+        for name in ("policy.pt", "policy.onnx"):
+            if (exported := path / "exported" / name).is_file():
+                return exported
+        checkpoints = sorted(path.glob("model_*.pt"), key=lambda file: int(re.sub(r"\D", "", file.stem) or 0))
+        if not checkpoints:
+            raise ValueError("it has no weights, expected exported/policy.pt or model_*.pt")
+        if (activation := read_activation(agent)) is not None:
+            source.set(activation=activation)
+        return checkpoints[-1]
+
+
+def _read_actuators(groups: dict[str, Any], source: Source) -> None:
+    """Gains, limits and delays."""
+    notes: list[str] = []
+    ideal = [name for name, group in groups.items() if group.get("saturation_effort") is None]
+    omitted = _IDEAL_DRIVE if len(ideal) == len(groups) else ()
+    keys = [key for key in PER_JOINT[1:] if key not in omitted]
+    values_by_key: dict[str, dict[str, Any]] = {key: dict.fromkeys(source.joints) for key in keys}
+    for name, group in groups.items():
+        drive = ("DelayedPDActuator", "PD gains with a limit") if name in ideal else ("DCMotor", "a DC motor")
+        kind = str(group.get("class_type", "")).rpartition(":")[2]
+        if kind not in ("", "ImplicitActuator", "IdealPDActuator", drive[0]):
+            notes.append(f"{name} is a {kind}, simulated as {drive[1]}")
+        if group.get("friction"):
+            notes.append(f"the friction of {name} is left out: give their joints a frictionloss")
+        group |= _IDEAL_DRIVE if name in ideal else {}
+        joints = _match_joints(group["joint_names_expr"], source.joints)
+        for key, values in values_by_key.items():
+            value = group.get(f"{key}_sim") if group.get(key) is None else group[key]
+            values |= zip(joints, per_joint(value, joints, f"{source.file}: {name}.{key}", partly=True), strict=True)
+    for key, values in values_by_key.items():
+        without = [joint for joint, value in values.items() if value is None]
+        named = ", ".join(f"{joint} {value}" for joint, value in values.items() if value is not None)
+        if not without:
+            reason = f"1e6 is that of an ideal drive, {', '.join(ideal)}" * bool(ideal and key in _IDEAL_DRIVE)
+            source.set(**{key: collapse([*values.values()])}, reason="; ".join(notes) if key == "stiffness" else reason)
+        elif named or key in ("stiffness", "damping"):
+            gap = f"a value of each joint{': ' * bool(named)}{named}; none is said of {', '.join(without)}"
+            source.set(**{key: None}, reason="; ".join([gap, *notes]))
+    delays = {name: (group.get("min_delay") or 0, group.get("max_delay") or 0) for name, group in groups.items()}
+    if any(longest for _, longest in delays.values()):
+        spans = ", ".join(f"{name} ({shortest} to {longest})" for name, (shortest, longest) in delays.items())
+        mean = int(np.mean([*delays.values()]) + 0.5)
+        source.set(drive_delay_steps=mean, reason=f"the mean of the delays of {spans}")
+
+
+def _match_joints(patterns: Any, joints: Sequence[str], keep_pattern_order: Any = False) -> list[str]:
+    """The joints that patterns name, in the order of the joints or in that of the patterns."""
+    patterns = patterns if isinstance(patterns, list) else [patterns]
+    named = dict.fromkeys(joint for pattern in patterns for joint in joints if re.fullmatch(pattern, joint))
+    return list(named) if keep_pattern_order else [joint for joint in joints if joint in named]
+
+
+def _read_action(actions: dict[str, Any], path: Path, source: Source) -> list[str]:
+    """Scale, offset and joints of the action; returns the order of all joints, which env.yaml does not say."""
+    if descriptors := sorted(path.rglob("*IO_descriptors.yaml")):
+        joint_order = read_yaml(descriptors[0])["articulations"]["robot"]["joint_names"]
+        reason = ""
+    else:
+        model = source.model
+        names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
+
+        def path_to(body: int) -> list[str]:
+            return [*path_to(int(model.body_parentid[body])), names[body]] if body in names else []
+
+        paths = sorted(map(path_to, names), key=lambda joints: (len(joints), joints))
+        joint_order = [joints[-1] for joints in paths]  # from the base outwards, a body's children by name
+        reason = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
+    kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items() if term is not None}
+    if list(kinds.values()) != ["JointPositionAction"]:
+        raise ValueError(f"{source.file}: actions must be one JointPositionAction, got {kinds}")
+    (name,) = kinds
+    term = actions[name]
+    label = f"{source.file}: actions.{name}"
+    if term.get("clip") is not None:
+        raise ValueError(f"{label}.clip limits targets, which is not supported: give joints that range")
+    joints = _match_joints(term["joint_names"], joint_order, term.get("preserve_order"))
+    source.set_joints(joints, reason)
+    source.set(action_scale=collapse(per_joint(term["scale"], joints, f"{label}.scale")))
+    if not term.get("use_default_offset", True):
+        offset = per_joint(term["offset"], joints, f"{label}.offset", partly=True)
+        source.set(action_offset=[angle or 0.0 for angle in offset])
+    return joint_order
+
+
+def _read_term(
+    name: str, term: dict[str, Any], scene: dict[str, Any], joint_order: Sequence[str], source: Source
+) -> dict[str, Any]:
+    function = re.split(r"[:.]", str(term["func"]))[-1]
+    params = term.get("params") or {}
+    if function not in _ISAAC_LAB_TERMS or term.get("modifiers"):
+        what = f"observation {name}, {term['func']}{' with modifiers' * bool(term.get('modifiers'))}"
+        raise ValueError(f"{source.file} says what is not understood: {what}; only {', '.join(_ISAAC_LAB_TERMS)}")
+    centre = source.model.body_ipos[1].round(5).tolist() if function == "base_lin_vel" else None
+    row = make_term(_ISAAC_LAB_TERMS[function], term.get("scale"), clip=term.get("clip"), at=centre)
+    if function in ("joint_pos_rel", "joint_vel_rel"):
+        asset = params.get("asset_cfg") or {}
+        joints = _match_joints(asset.get("joint_names") or ".*", joint_order, asset.get("preserve_order"))
+        if joints != source.settings.get("joints", list(source.joints)):
+            row["joints"] = joints
+    elif function == "gait_phase":
+        row["period_s"] = params["period"]
+    elif function == "height_scan":
+        sensor = scene[params["sensor_cfg"]["name"]]
+        grid = sensor["pattern_cfg"]
+        turns = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
+        if "resolution" not in grid or not turns:
+            raise ValueError(f"{source.file}: a height scanner must be a grid in the yaw frame, got {grid}")
+        row["order"] = "x fastest" if grid.get("ordering", "xy") == "xy" else "y fastest"
+        row["offset"] = params.get("offset", 0.5)
+        step = grid["resolution"]
+        for axis, side, mid in zip("xy", grid["size"], sensor["offset"]["pos"], strict=False):
+            row[axis] = [round(mid - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
+    return row

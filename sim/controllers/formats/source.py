@@ -1,0 +1,107 @@
+"""What a format of sources reads: settings of a robot and its controller, with the reasons of guesses."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.robots.compiled import PER_JOINT
+
+_NAMES_BY_TERM = {
+    "lin_vel": ("lin_vel", "base_lin_vel"),
+    "ang_vel": ("ang_vel", "ang_vel_body", "base_ang_vel"),
+    "gravity": ("gravity_vec", "projected_gravity"),
+    "command": ("commands", "command", "cmd", "velocity_commands"),
+    "joint_pos": ("dof_pos", "joint_pos"),
+    "joint_vel": ("dof_vel", "joint_vel"),
+    "last_action": ("actions", "last_action"),
+}
+TERM_NAMES = {name: term for term, names in _NAMES_BY_TERM.items() for name in names}
+"""Terms of the observation by the names that rl_sar and mjlab give them."""
+CLOCK_PERIOD = 0.8
+"""Of the clock in the code of rl_sar and unitree_rl_gym [s]."""
+BLIND_TERMS = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
+"""Terms of a controller without sight, in the usual order."""
+SETTINGS = ("default_joint_pos", "stiffness", "damping", "action_scale", "physics_dt", "decimation")
+"""Settings that most sources have, under names of their own."""
+
+
+@dataclass(kw_only=True)
+class Source:
+    """Settings that are read from a source, for a robot whose model is known."""
+
+    file: Path
+    """The file that errors name."""
+    model_file: Path
+    model: Any
+    """The compiled MuJoCo model."""
+    joints: tuple[str, ...]
+    """Joints of the model, in its order."""
+    home: list[float] | None
+    """The model's home pose [rad], if it has one."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """Fields of robot.toml and controller.toml; None where the user has to fill one in."""
+    reasons: dict[str, str] = field(default_factory=dict)
+    """Why a setting is a guess, or what the user should fill in."""
+
+    def set(self, reason: str = "", **settings: Any) -> None:
+        """Stores settings, with the reason if they are guesses."""
+        self.settings |= settings
+        self.reasons |= dict.fromkeys(settings, reason)
+
+    def refuse_unknown(self, names: Iterable[str], known: Iterable[str]) -> None:
+        """Raises a ValueError with the names that are not known."""
+        if unknown := [str(name) for name in names if name not in known]:
+            what = f"{self.file} says what is not understood: {', '.join(unknown)}"
+            raise ValueError(f"{what}: take it out if it does not matter")
+
+    def move(self, content: dict[str, Any], names: Mapping[str, str], joints: Sequence[str]) -> None:
+        """Moves values from ``content`` to settings of other names; lists of the source's joints are reordered."""
+        for key, name in names.items():
+            value = content.pop(key)
+            if name in PER_JOINT and isinstance(value, list):
+                if set(joints) != set(self.joints) or len(value) != len(joints):
+                    must = f"one a joint of {self.model_file}, {', '.join(self.joints)}"
+                    raise ValueError(f"{self.file}: {key} must be {must}, got {len(value)} of {', '.join(joints)}")
+                value = [value[list(joints).index(joint)] for joint in self.joints]
+            self.set(**{name: collapse(value)})
+
+    def set_joints(self, joints: Sequence[str], reason: str = "") -> None:
+        """Stores the controller's order of joints, if it is not that of the model."""
+        if tuple(joints) != self.joints:
+            self.set(joints=list(joints), reason=reason)
+
+    def set_history(self, terms: list[dict[str, Any]], lengths: Sequence[int]) -> None:
+        """Stores former steps as Isaac Lab and mjlab lay them out; lengths that differ are written into the terms."""
+        for term, length in zip(terms, lengths, strict=True):
+            term |= {"history": length} if len(set(lengths)) > 1 else {}
+        if max(lengths) > 1:
+            self.set(history={"length": max(lengths), "newest": "last", "by": "term", "fill": "first"})
+
+    def find_imu(self) -> list[float] | None:
+        """Position of the base's only site that is called after an IMU [m], shape (3,)."""
+        model = self.model
+        sites = [k for k in range(model.nsite) if model.site_bodyid[k] == 1 and "imu" in model.site(k).name.lower()]
+        return model.site_pos[sites[0]].round(5).tolist() if len(sites) == 1 else None
+
+
+def collapse(values: Any) -> Any:
+    """One value in place of a list of equal ones."""
+    return values[0] if isinstance(values, list) and all(value == values[0] for value in values) else values
+
+
+def make_term(name: str, scale: Any = None, **fields: Any) -> dict[str, Any]:
+    """A term of the observation, without a scale of 1 and fields that are None."""
+    if scale is not None and not np.all(np.equal(scale, 1.0)):
+        fields = {"scale": scale, **fields}
+    return {"term": name, **{key: value for key, value in fields.items() if value is not None}}
+
+
+def find_weights(folder: Path, name: str) -> Path:
+    """The file of weights in a folder; its name may have a path of another machine."""
+    file = folder / Path(name).name
+    if not file.is_file():
+        raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
+    return file
