@@ -12,6 +12,7 @@ from sim.controllers.formats.rl_sar import RlSar
 from sim.controllers.formats.source import Source
 from sim.controllers.formats.unitree_rl_gym import UnitreeRlGym
 from sim.controllers.formats.weights import Weights
+from sim.controllers.spec import data_file
 from sim.files.command import command_line
 from sim.files.settings import to_toml
 from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
@@ -47,14 +48,16 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
     if source_format is None:
         raise ValueError(f"{path} must be {', or '.join(source_format.label for source_format in FORMATS)}")
     weights_file = _read(source_format, path, source)
-    copy = out / weights_file.name
-    if copy.exists() and copy.read_bytes() != weights_file.read_bytes():
-        raise ValueError(f"{copy} must be a copy of {weights_file}, got other weights: move them away first")
+    copies = {file: out / file.name for file in (weights_file, data_file(weights_file)) if file is not None}
+    for file, copy in copies.items():
+        if copy.exists() and copy.read_bytes() != file.read_bytes():
+            raise ValueError(f"{copy} must be a copy of {file}, got other weights: move them away first")
     out.mkdir(parents=True, exist_ok=True)
     source.set(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights_file.name)
     print(f"{path} is read as {source_format.label}; its weights are {weights_file}.")
-    if not copy.exists():
-        shutil.copyfile(weights_file, copy)
+    for file, copy in copies.items():
+        if not copy.exists():
+            shutil.copyfile(file, copy)
     for file, names in _SETTINGS_BY_FILE.items():
         text = "".join(f"{_format_setting(name, source)}\n" for name in names if name in source.settings)
         (out / file).write_text(f"# Of {path.name}\n{text}", encoding="utf-8")

@@ -56,13 +56,13 @@ class ControllerSpec:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The Python file, the controller's file, the weights of a description, and the agent.yaml, if any."""
+        """The Python file, the controller's file, and the files of its network, if any."""
         files = [Path(self.module)] if self.module is not None and self.module.endswith(".py") else []
         if self.file is not None:
             files.append(Path(self.file))
             if files[-1].suffix == ".toml":
                 files += filter(None, [weights_file(files[-1])])
-            files += filter(None, [agent_file(files[-1])])
+            files += filter(None, [agent_file(files[-1]), data_file(files[-1])])
         return tuple(files)
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
@@ -87,6 +87,15 @@ def agent_file(weights: Path) -> Path | None:
     """The agent.yaml of the training that wrote a .pt file, if it is there."""
     files = (weights.parent / "agent.yaml", weights.parent / "params" / "agent.yaml")
     return next((file for file in files if weights.suffix == ".pt" and file.is_file()), None)
+
+
+def data_file(weights: Path) -> Path | None:
+    """The file beside an .onnx file that holds its weights, if it names one."""
+    if weights.suffix.lower() != ".onnx":
+        return None
+    from sim.controllers.formats.onnx_data import find_data_file  # onnx takes a moment to load
+
+    return find_data_file(weights)
 
 
 def resolve_policy(policy: str, robot: RobotCfg) -> str:

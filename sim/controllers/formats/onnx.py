@@ -1,17 +1,17 @@
-"""Controllers in ONNX files: data alone, from one file, run by onnxruntime; and checkpoints written as such files."""
+"""Controllers in ONNX files: data alone, run by onnxruntime; and checkpoints written as such files."""
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import onnxruntime
 import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch.nn import functional
 
+from sim.controllers.formats.onnx_data import read_onnx
 from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.runner import Recurrent, with_rows_of_zeros
 from sim.files.atomic import prepare_output, write_atomically
@@ -124,20 +124,16 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
     """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
 
     Its graph maps observations (batch, observation_size) to actions (batch, num_joints), both float32; states ``X_in``
-    and ``X_out``, (layers, batch, size), follow if it remembers. Only that file is read, and no code in it runs.
+    and ``X_out``, (layers, batch, size), follow if it remembers. Only these files are read; no code runs.
 
     A graph of plain layers becomes a torch module, if it maps random rows as onnxruntime does. Another graph for one
     robot is changed into one for any number, if that acts on each robot as before; else it runs once a robot.
     """
     target = torch.device(device)
     try:
-        data = path.read_bytes()
-        model = onnx.ModelProto.FromString(data)
+        model, data = read_onnx(path)
         if not model.graph.node:
             raise ValueError("it has no graph")
-        outside = [tensor.name for tensor in _tensors(model) if tensor.external_data or tensor.data_location]
-        if outside:
-            raise ValueError(f"it keeps {len(outside)} of its tensors in another file ('{outside[0]}' first)")
         policy = OnnxPolicy(data, target, sizes)
         if layers := _make_if_equal(lambda: OnnxLayers(model, policy), policy, 1e-5):
             return layers.to(target)
@@ -178,17 +174,6 @@ def _free_batch(model: Any) -> bytes:
             port.type.tensor_type.shape.dim[-2].dim_param = "batch"
     del model.graph.value_info[:]
     return model.SerializeToString()
-
-
-def _tensors(message: Any) -> Iterator[Any]:
-    """Every tensor in a model, those in subgraphs and attributes included."""
-    if message.DESCRIPTOR.full_name == "onnx.TensorProto":
-        yield message
-        return
-    for field, value in message.ListFields():
-        if field.message_type is not None:
-            for inner in [value] if hasattr(value, "DESCRIPTOR") else value:
-                yield from _tensors(inner)
 
 
 def _check_sizes(

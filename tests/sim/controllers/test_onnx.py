@@ -11,6 +11,7 @@ from sim.controllers.formats.onnx import export_onnx, load_onnx
 from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.loaders import load_actor, load_policy
 from sim.controllers.runner import is_graph_safe
+from sim.controllers.spec import ControllerSpec, controller_hash
 from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
 from tests.sim.controllers.test_loaders import runner_on
 
@@ -129,18 +130,43 @@ def test_a_model_that_does_not_fit_is_refused(tmp_path, anymal, model, capfd):
     assert capfd.readouterr() == ("", ""), "onnxruntime says it a second time"
 
 
-@pytest.mark.parametrize("deep", [False, True])
-def test_weights_in_another_file_are_refused(tmp_path, anymal, deep):
-    path = tmp_path / "split.onnx"
-    onnx.save(linear(), path, save_as_external_data=True, location="weights.bin", size_threshold=0)
-    if deep:
-        tensor, model = onnx.load(path, load_external_data=False).graph.initializer[1], linear()
-        constant = helper.make_node("Constant", [], ["c"], value=tensor)
-        branch = helper.make_graph([constant], "branch", [], [port("c", [ACTIONS])])
-        model.graph.node.append(helper.make_node("If", ["yes"], ["unused"], then_branch=branch, else_branch=branch))
-        save(path, model)
-    with pytest.raises(ValueError, match="2 of its tensors"):
+def split(path):
+    """One layer whose weights are in a file beside it, as torch 2.9 writes it, and where its tensors say they are."""
+    onnx.save(linear(), path, save_as_external_data=True, location="policy.onnx.data", size_threshold=0)
+    model = onnx.load(path, load_external_data=False)
+    return model, [{field.key: field for field in tensor.external_data} for tensor in model.graph.initializer]
+
+
+def test_weights_in_a_file_beside_it_belong_to_the_controller(tmp_path, anymal):
+    path = tmp_path / "policy.onnx"
+    split(path)
+    policy, whole = load_policy(path, anymal, "cpu"), load_policy(save(tmp_path / "w.onnx", linear()), anymal, "cpu")
+    assert torch.equal(policy(rows_of(7)), whole(rows_of(7))) and is_graph_safe(policy)
+    data = path.with_name("policy.onnx.data")
+    assert ControllerSpec.parse(path).files == (path, data)
+    before = controller_hash(path)
+    data.write_bytes(data.read_bytes()[::-1])
+    assert before != controller_hash(path)
+    data.unlink()
+    with pytest.raises(ValueError, match=r"policy\.onnx\.data"):
         load_policy(path, anymal, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "what"),
+    [("location", "../policy.onnx.data", "beside"), ("location", "/tmp/policy.onnx.data", "beside"),
+     ("location", "", "beside"), ("location", "link.data", "beside"), ("location", "more.data", "beside"),
+     ("length", "4", "'w'"), ("offset", "8", "'b'"), ("offset", "-4", "'w'")],
+)  # fmt: skip
+def test_weights_elsewhere_or_of_another_size_are_refused(tmp_path, anymal, key, value, what):
+    path = tmp_path / "mine" / "policy.onnx"
+    path.parent.mkdir()
+    (path.parent / "link.data").symlink_to(tmp_path / "elsewhere.data")
+    model, tensors = split(path)
+    for fields in tensors[: 1 if value == "more.data" else 2]:  # w, then b
+        fields[key].value = str(int(fields[key].value) + 8) if value == "8" else value
+    with pytest.raises(ValueError, match=rf"policy\.onnx.*{what}"):
+        load_policy(save(path, model), anymal, "cpu")
 
 
 @pytest.mark.skipif("CUDAExecutionProvider" in onnxruntime.get_available_providers(), reason="this one can use a GPU")

@@ -1,0 +1,71 @@
+"""ONNX files as data: a graph with its weights inside, or in one file beside it, as torch writes them since 2.9."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper
+
+
+def find_data_file(path: Path) -> Path | None:
+    """The file beside an ONNX file that it names for its weights; None if it names none, or is no ONNX file."""
+    try:
+        return _check_data_file(path, _read_graph(path)[1])
+    except (OSError, ValueError):  # loading it says so
+        return None
+
+
+def read_onnx(path: Path) -> tuple[Any, bytes]:
+    """The graph of a file with all its weights, and its bytes; a ValueError if any are not in the file beside it."""
+    model, outside = _read_graph(path)
+    file = _check_data_file(path, outside)
+    if file is None:
+        return model, path.read_bytes()
+    if not file.is_file():
+        raise ValueError(f"{file} with {len(outside)} of its tensors is not there: put it beside it")
+    data = file.read_bytes()
+    for tensor in outside:
+        fields = {field.key: field.value for field in tensor.external_data}
+        size = int(np.prod(tensor.dims)) * helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
+        start, length = int(fields.get("offset", 0)), int(fields.get("length", size))
+        if length != size or not 0 <= start <= len(data) - size:
+            got = f"{file} of {len(data)} bytes with {length} from {start} on"
+            raise ValueError(f"'{tensor.name}' has {size} bytes, got {got}: copy both files of one export")
+        tensor.raw_data = data[start : start + size]
+        tensor.data_location = TensorProto.DEFAULT
+        del tensor.external_data[:]
+    return model, model.SerializeToString()
+
+
+def _read_graph(path: Path) -> tuple[Any, list[Any]]:
+    """The graph of a file, and its tensors whose values are in another."""
+    try:
+        model = onnx.ModelProto.FromString(path.read_bytes())
+    except Exception as error:  # protobuf's errors have no base
+        raise ValueError(f"{path} is no ONNX file: {error}") from None
+    return model, [tensor for tensor in _tensors(model) if tensor.external_data or tensor.data_location]
+
+
+def _check_data_file(path: Path, outside: list[Any]) -> Path | None:
+    """The one file beside ``path`` that tensors name."""
+    names = {field.value for tensor in outside for field in tensor.external_data if field.key == "location"}
+    if not outside:
+        return None
+    file = path.parent / next(iter(names), "")
+    if len(names) != 1 or file.name not in names or file.resolve().parent != path.parent.resolve():
+        what = f"it keeps {len(outside)} of its tensors ('{outside[0].name}' first) in {', '.join(sorted(names))}"
+        raise ValueError(f"{what}: expected one file beside it")
+    return file
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """Every tensor in a model, those in subgraphs and attributes included."""
+    if message.DESCRIPTOR.full_name == "onnx.TensorProto":
+        yield message
+        return
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for inner in [value] if hasattr(value, "DESCRIPTOR") else value:
+                yield from _tensors(inner)
