@@ -53,7 +53,7 @@ $(STAMP): pyproject.toml constraints.txt $(ANEW)
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	grep -v $(if $(TORCH),'^torch==','^$$') constraints.txt > .venv/constraints.txt
 	$(if $(TORCH),$(BIN)/python -m pip install $(call quoted,$(TORCH)) && echo $(call quoted,$(TORCH)) > .venv/torch)
-	$(BIN)/python -m pip install --quiet -e '.[dev,cluster]' -c .venv/constraints.txt
+	$(BIN)/python -m pip install --quiet -e '.[dev,cluster,menagerie]' -c .venv/constraints.txt
 	@touch $@
 
 archive: setup ## Search the terrains on which a controller fails; writes a run under runs/

@@ -226,8 +226,9 @@ class ImportCommand:
     source: tyro.conf.Positional[Path]
     """A folder or YAML of rl_sar, a YAML of unitree_rl_gym's deploy_mujoco, an ONNX file of mjlab, a run folder of
     Isaac Lab, or weights alone."""
-    model: Path
-    """The robot's MJCF or URDF. It stays where it is."""
+    model: str | None = None
+    """The robot's MJCF or URDF, which stays where it is, or a robot of MuJoCo Menagerie: menagerie:unitree_go2. If left
+    out, the file that the source names, if it is here."""
     out: Path
     """Folder for the files, and a copy of the weights; the robot is called after it."""
 

@@ -15,7 +15,8 @@ from sim.controllers.formats.weights import Weights
 from sim.controllers.spec import data_file
 from sim.files.command import command_line
 from sim.files.settings import to_toml
-from sim.robots.compiled import PER_JOINT, joint_names, read_robot_file
+from sim.robots.compiled import PER_JOINT
+from sim.robots.model_files import MENAGERIE, find_model, find_robot_of_scene
 from sim.robots.user import NEW_NAME, is_new_name
 
 FORMATS = (IsaacLab(), UnitreeRlGym(), RlSar(), Mjlab(), Weights())
@@ -29,10 +30,11 @@ _SETTINGS_BY_FILE = {
 }
 
 
-def import_controller(path: Path, model_file: Path, out: Path) -> None:
+def import_controller(path: Path, model: str | Path | None, out: Path) -> None:
     """Writes robot.toml and controller.toml, with the weights beside them, to the folder ``out``, and prints both.
 
-    ``path`` is a source of one of :data:`FORMATS`, ``model_file`` MJCF or URDF; the robot is called after the folder.
+    ``path`` is a source of one of :data:`FORMATS`; the robot is called after the folder. ``model`` is what
+    :func:`sim.robots.model_files.find_model` finds; None if the source names its model.
     """
     if existing := [str(out / name) for name in _SETTINGS_BY_FILE if (out / name).exists()]:
         files = " and ".join(existing)
@@ -41,9 +43,7 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
         raise ValueError(f"--out must end in {NEW_NAME}, got {out}")
     if not path.exists():
         raise ValueError(f"{path} is not there: expected a folder, a YAML, or weights")
-    robot = read_robot_file(model_file)
-    joints = joint_names(robot.model)
-    source = Source(file=path, model_file=model_file, model=robot.model, joints=joints, home=robot.home)
+    source = Source(file=path, model_file=None if model is None else find_robot_of_scene(find_model(model)))
     source_format: Any = next((source_format for source_format in FORMATS if source_format.matches(path)), None)
     if source_format is None:
         raise ValueError(f"{path} must be {', or '.join(source_format.label for source_format in FORMATS)}")
@@ -53,8 +53,11 @@ def import_controller(path: Path, model_file: Path, out: Path) -> None:
         if copy.exists() and copy.read_bytes() != file.read_bytes():
             raise ValueError(f"{copy} must be a copy of {file}, got other weights: move them away first")
     out.mkdir(parents=True, exist_ok=True)
-    source.set(model_file=Path(os.path.relpath(model_file.resolve(), out.resolve())), policy=weights_file.name)
-    print(f"{path} is read as {source_format.label}; its weights are {weights_file}.")
+    model_file = source.model_file
+    is_named = model_file is None or str(model).startswith(MENAGERIE)
+    model_setting = str(model) if is_named else os.path.relpath(model_file.resolve(), out.resolve())
+    source.set(model_file=Path(model_setting), policy=weights_file.name)
+    print(f"{path} is read as {source_format.label}; its weights are {weights_file}, its model is {model_file}.")
     for file, copy in copies.items():
         if not copy.exists():
             shutil.copyfile(file, copy)
@@ -74,7 +77,8 @@ def _read(source_format: Any, path: Path, source: Source) -> Path:
     try:
         return source_format.read(path, source)
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError, re.error) as error:
-        if isinstance(error, ValueError) and str(source.file) in str(error):
+        files = {str(source.file), str(source.model_file)}
+        if isinstance(error, ValueError) and any(file in str(error) for file in files):
             raise
         problem = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         if not isinstance(error, KeyError | ValueError):

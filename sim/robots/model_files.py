@@ -1,6 +1,7 @@
 """The files that a robot's model is read from: MJCF or URDF, what it includes, and its meshes."""
 
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGE = "package://"
+MENAGERIE = "menagerie:"
+"""What a model of MuJoCo Menagerie begins with."""
 _SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf", ".png")  # .msh: MuJoCo's own
 
 
@@ -24,6 +27,49 @@ class ModelFiles:
     def is_urdf(self) -> bool:
         """Whether it is a URDF, else an MJCF."""
         return self.root.tag == "robot"
+
+
+def find_model(name: str | Path, folder: Path = Path()) -> Path:
+    """The file that ``name`` gives of a model: a path below ``folder``, or that of a robot of MuJoCo Menagerie.
+
+    ``menagerie:unitree_go2`` is the robot's default model; ``menagerie:unitree_go2/go2_mjx`` is another of its models.
+    Their package downloads a robot once.
+    """
+    robot_name, _, model_name = str(name).removeprefix(MENAGERIE).partition("/")
+    if not str(name).startswith(MENAGERIE):
+        return folder / name
+    try:
+        import mujoco_menagerie as menagerie  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise ValueError(f"{name} needs MuJoCo Menagerie: pip install 'faultline[menagerie]'") from None
+    try:
+        robot = menagerie.get(robot_name)
+        return robot.xml(model_name or robot.default_model)
+    except menagerie.MenagerieError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def find_above(name: str, folder: Path) -> Path | None:
+    """The file that a file of ``folder`` names, in this folder or in one above; None if it is not there.
+
+    What stands for a folder is left out: ``{LEGGED_GYM_ROOT_DIR}/``, ``package://``, and the name of the package. A name
+    without a folder is looked for in ``folder`` alone.
+    """
+    path = Path(re.sub(r"^(\{\w+\}/|package://|file://)", "", name))
+    paths = [path, Path(*path.parts[1:])] if name.startswith(_PACKAGE) else [path]
+    folders = [folder, *folder.resolve().parents][: None if len(path.parts) > 1 else 1]
+    return next((file for path in paths for parent in folders if (file := parent / path).is_file()), None)
+
+
+def find_robot_of_scene(model_file: Path) -> Path:
+    """The file that a scene includes for its robot; ``model_file`` itself if it has bodies, or is no MJCF."""
+    try:
+        root = ET.parse(model_file).getroot()
+    except (ET.ParseError, OSError, ValueError):
+        return model_file  # who reads it says why
+    names = [element.get("file", "") for element in root.findall("include")]
+    is_scene = root.tag == "mujoco" and len(names) == 1 and root.find("worldbody/body") is None
+    return model_file.parent / names[0] if is_scene else model_file
 
 
 def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
@@ -102,12 +148,11 @@ def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
     name = mesh.get("filename", "").removeprefix("file://")
     path = model_file.parent / name
     if name.startswith(_PACKAGE):
-        package, _, rest = name.removeprefix(_PACKAGE).partition("/")
-        holds = [folder for folder in model_file.resolve().parents if folder.name == package]
-        if not holds:
+        path = find_above(name, model_file.parent)
+        if path is None:
+            package = name.removeprefix(_PACKAGE).partition("/")[0]
             remedy = "put the URDF into its package, or write the mesh's path relative to the URDF"
-            raise ValueError(f"{model_file}: mesh {name} is in package {package}, which no folder above is: {remedy}")
-        path = holds[0] / rest
+            raise ValueError(f"{model_file}: mesh {name} is not in package {package} of a folder above: {remedy}")
     elif "://" in name:
         raise ValueError(f"{model_file}: mesh {name} must be a file here: nothing is downloaded")
     return Path(os.path.abspath(path))

@@ -18,7 +18,7 @@ from sim.device import host_device
 from sim.files.settings import check_settings, from_builtins, read_toml, to_toml
 from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, mj, read_robot_file
 from sim.robots.model import make_builder
-from sim.robots.model_files import read_model_files
+from sim.robots.model_files import find_model, read_model_files
 from sim.robots.probes import make_probes, measure_extents, start_height
 from sim.robots.robot import ROBOTS, RobotCfg
 
@@ -43,7 +43,7 @@ def load_robot(path: Path) -> RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
         raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/robots.md)")
     try:
-        robot = replace(robot, model_file=file.parent / robot.model_file, settings_file=file)
+        robot = replace(robot, model_file=find_model(robot.model_file, file.parent), settings_file=file)
         check_settings(robot)
         robot_file = read_robot_file(robot.model_file)
         builder = make_builder(robot_file.model)
@@ -70,7 +70,7 @@ def _read_toml(path: Path, file: Path) -> RobotCfg:
         raise ValueError(f"{path}: {', '.join(no_list)} must be a list of names")
     if not isinstance(settings.get("model_file"), str):
         raise ValueError(f'{path} must name its MJCF or URDF: model_file = "robot.xml"')
-    robot_file = read_robot_file(file.parent / settings["model_file"])
+    robot_file = read_robot_file(find_model(settings["model_file"], file.parent))
     joints = joint_names(robot_file.model)
     settings |= {name: per_joint(settings[name], joints, f"{path}: {name}") for name in PER_JOINT if name in settings}
     return from_builtins(RobotCfg, infer_settings(settings, file, robot_file), str(path))

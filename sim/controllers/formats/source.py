@@ -2,12 +2,14 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sim.robots.compiled import PER_JOINT
+from sim.robots.compiled import PER_JOINT, RobotFile, joint_names, read_robot_file
+from sim.robots.model_files import find_above, find_robot_of_scene
 
 _NAMES_BY_TERM = {
     "lin_vel": ("lin_vel", "base_lin_vel"),
@@ -30,21 +32,44 @@ SETTINGS = ("default_joint_pos", "stiffness", "damping", "action_scale", "physic
 
 @dataclass(kw_only=True)
 class Source:
-    """Settings that are read from a source, for a robot whose model is known."""
+    """Settings that are read from a source, for a robot whose model the user or the source names."""
 
     file: Path
     """The file that errors name."""
-    model_file: Path
-    model: Any
-    """The compiled MuJoCo model."""
-    joints: tuple[str, ...]
-    """Joints of the model, in its order."""
-    home: list[float] | None
-    """The model's home pose [rad], if it has one."""
+    model_file: Path | None
+    """The robot's MJCF or URDF; None until it is known."""
     settings: dict[str, Any] = field(default_factory=dict)
     """Fields of robot.toml and controller.toml; None where the user has to fill one in."""
     reasons: dict[str, str] = field(default_factory=dict)
     """Why a setting is a guess, or what the user should fill in."""
+
+    @cached_property
+    def robot_file(self) -> RobotFile:
+        """The robot's model."""
+        if self.model_file is None:
+            raise ValueError(f"--model must name the robot's MJCF or URDF: {self.file} names none that is here")
+        return read_robot_file(self.model_file)
+
+    @property
+    def model(self) -> Any:
+        """The compiled MuJoCo model."""
+        return self.robot_file.model
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints of the model, in its order."""
+        return joint_names(self.model)
+
+    @property
+    def home(self) -> list[float] | None:
+        """The model's home pose [rad], if it has one."""
+        return self.robot_file.home
+
+    def find_model_file(self, name: Any) -> None:
+        """Takes the model that the source names, if the user names none and it is here."""
+        if self.model_file is None and isinstance(name, str):
+            model_file = find_above(name, self.file.parent)
+            self.model_file = model_file and find_robot_of_scene(model_file)
 
     def set(self, reason: str = "", **settings: Any) -> None:
         """Stores settings, with the reason if they are guesses."""
@@ -100,8 +125,8 @@ def make_term(name: str, scale: Any = None, **fields: Any) -> dict[str, Any]:
 
 
 def find_weights(folder: Path, name: str) -> Path:
-    """The file of weights in a folder; its name may have a path of another machine."""
-    file = folder / Path(name).name
+    """The file of weights that a source in ``folder`` names; its name may have a path of another machine."""
+    file = find_above(name, folder) or folder / Path(name).name
     if not file.is_file():
         raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
     return file

@@ -28,6 +28,7 @@ class UnitreeRlGym:
     def read(self, path: Path, source: Source) -> Path:
         """Settings of the YAML, and the observation of the script, with a clock if there are two columns for it."""
         content = read_yaml(path)
+        source.find_model_file(content.pop("xml_path", None))
         count = content.pop("num_actions")
         width = content.pop("num_obs")
         if count != len(source.joints):
@@ -46,5 +47,5 @@ class UnitreeRlGym:
             reason += ", and the period of its clock"
         source.set(observation=terms, reason=reason)
         weights = find_weights(path.parent, content.pop("policy_path"))
-        source.refuse_unknown(content, ("xml_path", "simulation_duration", "cmd_init"))
+        source.refuse_unknown(content, ("simulation_duration", "cmd_init"))
         return weights

@@ -152,6 +152,18 @@ def test_a_deployment_of_unitree_has_its_scripts_observation(tmp_path):
         imported(tmp_path / "dog.yaml", tmp_path)
 
 
+def test_weights_and_the_model_of_a_deployment_may_be_in_folders_above(tmp_path):
+    source = write(tmp_path / "deploy" / "dog.yaml", DEPLOYMENT | {"xml_path": "{LEGGED_GYM_ROOT_DIR}/model/scene.xml"})
+    write(tmp_path / "pre_train" / "policy.pt", 35)
+    write(tmp_path / "model" / "scene.xml", '<mujoco><include file="dog.xml"/></mujoco>')
+    write(tmp_path / "model" / "dog.xml", mjcf(drive='<motor joint="{0}"/>'))
+    import_controller(source, None, tmp_path / "mine" / "dog")
+    assert get_robot(str(tmp_path / "mine" / "dog" / "robot.toml")).model_file.name == "dog.xml"
+    (tmp_path / "model" / "scene.xml").unlink()
+    with pytest.raises(ValueError, match="--model must name"):
+        import_controller(source, None, tmp_path / "mine" / "cat")
+
+
 def test_the_metadata_of_mjlab_are_read(tmp_path):
     robot, controller = imported(mjlab(tmp_path), tmp_path)
     assert (robot.stiffness, robot.default_joint_pos) == ((20.0,) * 8, (0.6, -1.2) * 4)
