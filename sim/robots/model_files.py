@@ -52,8 +52,8 @@ def find_model(name: str | Path, folder: Path = Path()) -> Path:
 def find_above(name: str, folder: Path) -> Path | None:
     """The file that a file of ``folder`` names, in this folder or in one above; None if it is not there.
 
-    What stands for a folder is left out: ``{LEGGED_GYM_ROOT_DIR}/``, ``package://``, and the name of the package. A name
-    without a folder is looked for in ``folder`` alone.
+    What stands for a folder is left out: ``{LEGGED_GYM_ROOT_DIR}/``, ``package://``, a package's name. A name without a
+    folder is looked for in ``folder`` alone.
     """
     path = Path(re.sub(r"^(\{\w+\}/|package://|file://)", "", name))
     paths = [path, Path(*path.parts[1:])] if name.startswith(_PACKAGE) else [path]
