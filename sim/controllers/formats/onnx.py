@@ -1,5 +1,7 @@
 """Controllers in ONNX files: data alone, run by onnxruntime; and checkpoints written as such files."""
 
+import functools
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,8 +22,64 @@ _OPSET = 17  # of 2022, since robots rarely run a new onnxruntime
 _IR_VERSION = 8
 _OPERATORS = {name: name.capitalize() for name in ("elu", "selu", "relu", "tanh", "sigmoid", "softplus", "identity")}
 _OPERATORS["lrelu"] = "LeakyRelu"
+_BINARY = ("Add", "Sub", "Mul", "Div", "Pow", "MatMul")
+_UNARY = ("Abs", "Cos", "Erf", "Exp", "Log", "Neg", "Sigmoid", "Sin", "Sqrt", "Tanh")
 _CPU = "CPUExecutionProvider"
 _CUDA = "CUDAExecutionProvider"
+
+
+class _Ports:
+    """What a graph takes and returns: columns of the rows in the order of its inputs, states, and actions."""
+
+    def __init__(self, inputs: Sequence[Any], outputs: Sequence[Any], sizes: tuple[int, int] | None) -> None:
+        """From onnxruntime's ports; ``sizes`` of observation and action are those of the graph if None."""
+        self.axes: dict[str, int] = {}
+        """Axis of robots of each input."""
+        self.is_single = False
+        names = [port.name for port in outputs]
+        pairs = {port.name: f"{port.name.removesuffix('_in')}_out" for port in inputs}
+        pairs = {name: output for name, output in pairs.items() if output in names}
+        rest = [port for port in outputs if port.name not in pairs.values()]
+        actions = [port for port in rest if "action" in port.name] or rest
+        self.columns = {port.name: self._read_shape(port) for port in inputs if port.name not in pairs}
+        """Shape of one robot's input, and of its states, by their names; None where it is free."""
+        self.states = {port.name: self._read_shape(port, (1, 0)) for port in inputs if port.name in pairs}
+        if not rest or not self.columns or None in sum(self.states.values(), ()):
+            got = f"{', '.join(port.name for port in inputs)} and {', '.join(names)}"
+            raise ValueError(f"it must have an input and an output, and states X_in and X_out, got {got}")
+        shapes = self.columns.values()
+        width = None if None in sum(shapes, ()) else sum(map(math.prod, shapes))
+        count = self._read_shape(actions[0])[-1]
+        self.sizes: tuple[Any, Any] = sizes or (width, count)
+        if None in self.sizes or (width is None and len(self.columns) > 1):
+            raise ValueError(f"its rows must have known widths, got {self.columns} and {count}")
+        if any(known not in (None, size) for known, size in zip((width, count), self.sizes, strict=True)):
+            raise ValueError(f"expected {self.sizes[0]} observations and {self.sizes[1]} actions, got {(width, count)}")
+        if width is None:
+            self.columns = dict.fromkeys(self.columns, (self.sizes[0],))
+        self.outputs = {actions[0].name: 0} | {pairs[name]: self.axes[name] for name in self.states}
+        """Axis of robots of each output that is needed."""
+        self.ignored = [name for name in names if name not in self.outputs]
+
+    def _read_shape(self, port: Any, axes: Sequence[int] = (0,)) -> tuple[Any, ...]:
+        """The shape of one robot's tensor, None where it is free; robots stand along one of the axes."""
+        shape = [size if isinstance(size, int) else None for size in port.shape or (None, None)]  # if it is unknown
+        axes = sorted(
+            axes, key=lambda axis: shape[axis : axis + 1] != [None]
+        )  # layers, batch, size; or the batch first
+        axis = next((axis for axis in axes if shape[axis : axis + 1] in ([None], [1])), None)
+        if port.type != "tensor(float)" or len(shape) < 2 or axis is None:
+            must = "float32 of shape (batch, size) with a batch that is free or 1"
+            raise ValueError(f"'{port.name}' must be {must}, got {port.type} of shape {port.shape}")
+        self.is_single |= shape[axis] == 1
+        self.axes[port.name] = axis
+        return (*shape[:axis], *shape[axis + 1 :])
+
+    def feed(self, rows: torch.Tensor, states: Sequence[torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Inputs by their names, robots first, from rows (num_rows, observation_size) and states."""
+        parts = rows.split([math.prod(shape) for shape in self.columns.values()], dim=1)
+        columns = [part.reshape(len(rows), *shape) for part, shape in zip(parts, self.columns.values(), strict=True)]
+        return dict(zip((*self.columns, *self.states), (*columns, *states), strict=True))
 
 
 class OnnxPolicy:
@@ -40,79 +98,134 @@ class OnnxPolicy:
             # TF32 would round every product to 10 bits.
             providers = [(_CUDA, {"device_id": str(device.index or 0), "use_tf32": "0"}), _CPU]
         self.session = onnxruntime.InferenceSession(data, options, providers=providers, enable_fallback=0)
-        self.ports = self.session.get_inputs(), self.session.get_outputs()
-        self.sizes, self.states, self.is_single = _check_sizes(*self.ports, sizes)
+        self.ports = _Ports(self.session.get_inputs(), self.session.get_outputs(), sizes)
+        self.sizes = self.ports.sizes
 
     def __call__(self, observation: torch.Tensor) -> torch.Tensor:
         """Actions (num_envs, num_joints) on the device of the observations (num_envs, observation_size)."""
-        return self.run([observation])[0]
+        return self.run(observation, ())[0]
 
-    def run(self, inputs: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """Outputs for the graph's inputs, in its order, on their device; a graph for one robot runs once a robot."""
-        values = [value.detach().cpu().float() for value in inputs]
-        names = [port.name for port in self.ports[0]]
-        calls = zip(*(value.split(1, dim=-2) for value in values), strict=True) if self.is_single else [values]
-        results = [self.session.run(None, dict(zip(names, map(np.asarray, call), strict=True))) for call in calls]
-        outputs = [np.concatenate(rows, axis=-2) for rows in zip(*results, strict=True)]
-        return [torch.from_numpy(output).to(inputs[0].device) for output in outputs]
+    def run(self, rows: torch.Tensor, states: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """Actions of the rows and the states after them, robots first; a graph for one robot runs once a robot."""
+        axes, outputs = self.ports.axes, self.ports.outputs
+        inputs = {name: value.detach().cpu().float() for name, value in self.ports.feed(rows, states).items()}
+        size = 1 if self.ports.is_single else len(rows)
+        results: list[list[Any]] = []
+        for parts in zip(*(value.split(size) for value in inputs.values()), strict=True):
+            feed = {name: part.movedim(0, axes[name]).numpy() for name, part in zip(inputs, parts, strict=True)}
+            values: Any = self.session.run([*outputs], feed)
+            results.append([np.moveaxis(value, axis, 0) for value, axis in zip(values, outputs.values(), strict=True)])
+        return [torch.from_numpy(np.concatenate(values)).to(rows.device) for values in zip(*results, strict=True)]
 
 
 class _OnnxRecurrent(Recurrent):
-    """A controller that remembers: states of shape (layers, num_envs, size) go in and come out."""
+    """A controller that remembers: states go in and come out."""
 
-    graph_safe = False
-
-    def __init__(self, policy: OnnxPolicy) -> None:
-        super().__init__([torch.zeros(layers, 1, size) for layers, _, size in policy.states], 1)
-        self.sizes = policy.sizes
-        self._run = policy.run
+    def __init__(self, network: "OnnxPolicy | OnnxLayers", ports: _Ports) -> None:
+        super().__init__([torch.zeros(1, *shape) for shape in ports.states.values()], 0)
+        self.sizes = ports.sizes
+        self.network = network
+        self.graph_safe = isinstance(network, OnnxLayers)
 
     def step(self, rows: torch.Tensor, state: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        action, *after = self._run([rows, *state])
+        action, *after = self.network.run(rows, state)
         return action, after
 
 
 class OnnxLayers(torch.nn.Module):
     """A controller whose graph has only plain layers, in torch's operators, so that it can be captured."""
 
-    def __init__(self, model: Any, policy: OnnxPolicy) -> None:
-        """From a graph and onnxruntime's policy of it; a KeyError if it has another operator."""
+    def __init__(self, model: Any, ports: _Ports, *, each: bool = False) -> None:
+        """From a graph and its ports; any error if it has another operator. With ``each`` it runs for each robot."""
         super().__init__()
-        self.sizes = policy.sizes
-        self._input, self._output = (ports[0].name for ports in policy.ports)
-        constants = {tensor.name: tensor for tensor in model.graph.initializer}
-        self._nodes: list[tuple[Callable[..., Any], list[str], list[str], dict[str, Any]]] = []
+        self.sizes = ports.sizes
+        self._ports = ports
+        self._each = each
+        constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+        self._nodes: list[tuple[Callable[..., Any], list[Any], list[str], dict[str, Any]]] = []
         for node in model.graph.node:
             attributes = {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
             if node.op_type == "Constant":
-                constants[node.output[0]] = attributes["value"]
+                constants[node.output[0]] = numpy_helper.to_array(attributes["value"])
                 continue
             if node.op_type == "Split":
-                attributes["chunks"] = len(node.output)
-            self._nodes.append((_LAYERS[node.op_type], [*node.input], [*node.output], attributes))
+                attributes["num_outputs"] = len(node.output)
+            arguments: list[Any] = [*node.input]
+            if node.op_type in _OF_NUMBERS:  # of the graph; a device would have to be waited for
+                arguments[1:] = [constants[name].tolist() if name else None for name in arguments[1:]]
+            self._nodes.append((_LAYERS[node.op_type], arguments, [*node.output], attributes))
         self._names = list(constants)
-        weights = [torch.tensor(numpy_helper.to_array(tensor)) for tensor in constants.values()]
+        weights = [torch.tensor(value) for value in constants.values()]
         self.weights = torch.nn.ParameterList(torch.nn.Parameter(weight, requires_grad=False) for weight in weights)
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints)."""
-        values = dict(zip(self._names, self.weights, strict=True)) | {self._input: with_rows_of_zeros(rows)}
-        for layer, inputs, outputs, attributes in self._nodes:
-            value = layer(*(values[name] for name in inputs), **attributes)
-            values |= zip(outputs, value if isinstance(value, tuple) else [value], strict=True)
-        return values[self._output][: len(rows)]
+        return self.run(with_rows_of_zeros(rows), ())[0][: len(rows)]
 
-    def run(self, inputs: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    def run(self, rows: torch.Tensor, states: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """:meth:`OnnxPolicy.run` of the same graph."""
-        return [self(*inputs)]
+        inputs = self._ports.feed(rows, states)
+        if self._each:
+            return torch.vmap(lambda values: self._compute(values, torch.unsqueeze, torch.squeeze))(inputs)
+        return self._compute(
+            inputs, lambda value, axis: value.movedim(0, axis), lambda value, axis: value.movedim(axis, 0)
+        )
+
+    def _compute(self, inputs: dict[str, Any], enter: Callable[..., Any], leave: Callable[..., Any]) -> list[Any]:
+        """The graph's outputs; ``enter`` and ``leave`` give inputs, and take from outputs, the axis of robots."""
+        values: dict[Any, Any] = dict(zip(self._names, self.weights, strict=True))
+        values |= {name: enter(value, self._ports.axes[name]) for name, value in inputs.items()}
+        for layer, arguments, outputs, attributes in self._nodes:
+            value = layer(*(values[name] if isinstance(name, str) else name for name in arguments), **attributes)
+            values |= zip(outputs, value if isinstance(value, tuple) else [value], strict=True)
+        return [leave(values[name], axis) for name, axis in self._ports.outputs.items()]
 
 
+def _slice(value: torch.Tensor, starts: Any, ends: Any, axes: Any = None, steps: Any = None) -> torch.Tensor:
+    index = [slice(None)] * value.ndim
+    for k, axis in enumerate(axes or range(len(starts))):
+        index[axis] = slice(starts[k], ends[k], steps[k] if steps else 1)
+    return value[tuple(index)]
+
+
+def _gather(value: torch.Tensor, index: torch.Tensor, *, axis: int = 0) -> torch.Tensor:
+    axis %= value.ndim
+    rows = value.index_select(axis, index.flatten())
+    return rows.reshape(*value.shape[:axis], *index.shape, *value.shape[axis + 1 :])
+
+
+def _unsqueeze(value: torch.Tensor, axes: Any) -> torch.Tensor:
+    for axis in sorted(axis % (value.ndim + len(axes)) for axis in axes):
+        value = value.unsqueeze(axis)
+    return value
+
+
+_OF_NUMBERS = ("Clip", "ReduceMean", "Reshape", "Slice", "Split", "Squeeze", "Unsqueeze")
 _LAYERS: dict[str, Callable[..., Any]] = {
-    **{name: getattr(torch, name.lower()) for name in ("Add", "Sub", "Mul", "Div", "MatMul", "Tanh", "Sigmoid")},
+    **{name: getattr(torch, name.lower()) for name in (*_BINARY, *_UNARY)},
     **{name: getattr(functional, name.lower()) for name in ("Elu", "Selu", "Relu", "Softplus")},
     "LeakyRelu": lambda value, alpha=0.01: functional.leaky_relu(value, alpha),
     "Identity": torch.clone,
-    "Split": lambda value, *, chunks, axis=0: value.chunk(chunks, axis),
+    "Max": lambda *values: functools.reduce(torch.maximum, values),
+    "Min": lambda *values: functools.reduce(torch.minimum, values),
+    "Clip": lambda value, min=None, max=None: value.clamp(min, max),
+    "Softmax": lambda value, *, axis=-1: value.softmax(axis),
+    "Split": lambda value, sizes=None, *, num_outputs, axis=0, split=None: (
+        value.split(sizes or split, axis) if sizes or split else value.chunk(num_outputs, axis)
+    ),
+    "Concat": lambda *values, axis: torch.cat(values, axis),
+    "Gather": _gather,
+    "GatherND": lambda value, index, **attributes: value[index[None].unbind(-1)][0],
+    "Reshape": lambda value, shape, **attributes: value.reshape(shape),
+    "Flatten": lambda value, *, axis=1: value.flatten(axis),
+    "Transpose": lambda value, *, perm: value.permute(perm),
+    "Slice": _slice,
+    "Squeeze": lambda value, axes: value.squeeze(axes),
+    "Unsqueeze": _unsqueeze,
+    "ReduceMean": lambda value, axes=(), *, keepdims=1, **attributes: value.mean(axes, bool(keepdims)),
+    "LayerNormalization": lambda value, weight, bias=None, *, axis=-1, epsilon=1e-5, **attributes: (
+        functional.layer_norm(value, value.shape[axis:], weight, bias, epsilon)
+    ),
     "Gemm": lambda rows, weight, bias, alpha=1.0, beta=1.0, **attributes: torch.addmm(
         bias, rows, weight.T if attributes.get("transB") else weight, alpha=alpha, beta=beta
     ),
@@ -123,8 +236,9 @@ _LAYERS: dict[str, Callable[..., Any]] = {
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
     """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
 
-    Its graph maps observations (batch, observation_size) to actions (batch, num_joints), both float32; states ``X_in``
-    and ``X_out``, (layers, batch, size), follow if it remembers. Only these files are read; no code runs.
+    Its inputs are columns of the observation (batch, observation_size) in their order, and the states that it returned;
+    its outputs actions (batch, num_joints), and states called X_out for the inputs X or X_in. Others are ignored. Only
+    these files are read; no code runs.
 
     A graph of plain layers becomes a torch module, if it maps random rows as onnxruntime does. Another graph for one
     robot is changed into one for any number, if that acts on each robot as before; else it runs once a robot.
@@ -135,73 +249,53 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
         if not model.graph.node:
             raise ValueError("it has no graph")
         policy = OnnxPolicy(data, target, sizes)
-        if layers := _make_if_equal(lambda: OnnxLayers(model, policy), policy, 1e-5):
-            return layers.to(target)
-        if policy.is_single:
-            policy = _make_if_equal(lambda: OnnxPolicy(_free_batch(model), target, sizes), policy, 1e-4) or policy
+        ports = policy.ports
+        makers: list[Callable[[], Any]] = [lambda: OnnxLayers(model, ports)]
+        if ports.is_single:
+            makers.append(lambda: OnnxLayers(model, ports, each=True))
+            makers.append(lambda: OnnxPolicy(_free_batch(model, ports), target, sizes))
+        network: Any = next(filter(None, (_make_if_equal(make, policy) for make in makers)), policy)
     except Exception as error:  # protobuf and onnxruntime have errors of their own, without a base
         raise ValueError(f"policy '{path}' is no ONNX file of this robot: {error}: export it anew") from None
-    if target.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
-        what = "runs on the CPU, since this onnxruntime has no CUDA that works"
-        remedy = "install onnxruntime-gpu, or give the rsl_rl checkpoint"
-        warnings.warn(f"policy '{path}' has more than plain layers and {what}: {remedy}", stacklevel=2)
-    if policy.is_single:
-        warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
-    return _OnnxRecurrent(policy).to(target) if policy.states else policy
+    if ports.ignored:
+        warnings.warn(
+            f"policy '{path}' returns more than actions: {', '.join(ports.ignored)} are ignored", stacklevel=2
+        )
+    if isinstance(network, OnnxPolicy):
+        if target.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
+            what = "runs on the CPU, since this onnxruntime has no CUDA that works"
+            remedy = "install onnxruntime-gpu, or give the rsl_rl checkpoint"
+            warnings.warn(f"policy '{path}' has more than plain layers and {what}: {remedy}", stacklevel=2)
+        if network.ports.is_single:
+            warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
+    network = _OnnxRecurrent(network, ports) if ports.states else network
+    return network if isinstance(network, OnnxPolicy) else network.to(target)
 
 
-def _make_if_equal(make: Callable[[], Any], policy: OnnxPolicy, tolerance: float) -> Any:
+def _make_if_equal(make: Callable[[], Any], policy: OnnxPolicy) -> Any:
     """The result of ``make`` if it maps random rows, and states, as the policy does; else None."""
     generator = torch.Generator().manual_seed(0)
-    shapes = [(1, policy.sizes[0]), *policy.states]
+    shapes = [(policy.sizes[0],), *policy.ports.states.values()]
     try:
         made = make()
         for count, size in ((1, 0.1), (5, 1.0), (40, 3.0)):
-            inputs = [size * torch.randn([*shape[:-2], count, shape[-1]], generator=generator) for shape in shapes]
-            for value, expected in zip(made.run(inputs), policy.run(inputs), strict=True):
+            rows, *states = (size * torch.randn([count, *shape], generator=generator) for shape in shapes)
+            for value, expected in zip(made.run(rows, states), policy.run(rows, states), strict=True):
                 largest = max(1.0, float(expected.abs().max()))
-                torch.testing.assert_close(value, expected, rtol=0.0, atol=tolerance * largest)
+                torch.testing.assert_close(value, expected, rtol=0.0, atol=1e-4 * largest)
     except Exception:  # onnxruntime's errors have no base
         return None
     return made
 
 
-def _free_batch(model: Any) -> bytes:
+def _free_batch(model: Any, ports: _Ports) -> bytes:
     """The graph for any number of robots."""
-    constants = {tensor.name for tensor in model.graph.initializer}
+    axes = ports.axes | ports.outputs
     for port in (*model.graph.input, *model.graph.output):
-        if port.name not in constants:
-            port.type.tensor_type.shape.dim[-2].dim_param = "batch"
+        if port.name in axes:
+            port.type.tensor_type.shape.dim[axes[port.name]].dim_param = "batch"
     del model.graph.value_info[:]
     return model.SerializeToString()
-
-
-def _check_sizes(
-    inputs: Any, outputs: Any, sizes: tuple[int, int] | None
-) -> tuple[tuple[int, int], list[list[int]], bool]:
-    """Widths of observation and action, shapes of the states, and whether the graph is for one robot."""
-    if [port.name for port in inputs[1:]] != [f"{port.name.removesuffix('_out')}_in" for port in outputs[1:]]:
-        got = " and ".join(", ".join(port.name for port in ports) for ports in (inputs, outputs))
-        must = "one input and one output, and after them the states X_in and X_out if it remembers"
-        raise ValueError(f"it must have {must}, got {got}")
-    ends = {"input": inputs[0], "output": outputs[0]}
-    shapes = [list(port.shape or [None, None]) for port in ends.values()]  # an output's may be unknown
-    for (kind, port), shape in zip(ends.items(), shapes, strict=True):
-        if port.type != "tensor(float)" or len(shape) != 2:
-            raise ValueError(f"its {kind} must be float32 of shape (batch, size), got {port.type} of shape {shape}")
-    states = [list(port.shape) for port in inputs[1:]]
-    if any(len(shape) != 3 or not isinstance(shape[0], int) or not isinstance(shape[2], int) for shape in states):
-        raise ValueError(f"its states must have shape (layers, batch, size), got {states}")
-    batches = {shape[-2] for shape in (*shapes, *states) if isinstance(shape[-2], int)}
-    if batches - {1}:
-        raise ValueError(f"its batch must be free, or of one robot, got {max(batches)}: make its first axis dynamic")
-    widths: tuple[Any, Any] = (shapes[0][1], shapes[1][1])
-    sizes = sizes or widths
-    if not all(isinstance(size, int) for size in sizes):
-        raise ValueError(f"its rows must have known widths, got {widths}")
-    if any(isinstance(width, int) and width != size for width, size in zip(widths, sizes, strict=True)):
-        raise ValueError(f"expected {sizes[0]} observations and {sizes[1]} actions, got {widths}")
-    return sizes, states, bool(batches)
 
 
 def export_onnx(policy: MlpPolicy, path: Path) -> None:

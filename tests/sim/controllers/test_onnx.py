@@ -90,8 +90,8 @@ def test_a_row_is_answered_alike_in_any_batch_and_a_width_may_be_unknown(tmp_pat
 
 def test_a_graph_that_knows_of_one_robot_runs_once_a_robot(tmp_path, anymal):
     with pytest.warns(UserWarning, match=r"bound\.onnx.*one robot after the other"):
-        bound = load_policy(save(tmp_path / "bound.onnx", chain("Tanh", bound=True)[0]), anymal, "cpu")
-    known = load_policy(save(tmp_path / "free.onnx", chain("Tanh")[0]), anymal, "cpu")
+        bound = load_policy(save(tmp_path / "bound.onnx", chain("Softsign", bound=True)[0]), anymal, "cpu")
+    known = load_policy(save(tmp_path / "free.onnx", chain("Softsign")[0]), anymal, "cpu")
     torch.testing.assert_close(bound(rows_of(7)), known(rows_of(7)), rtol=1e-4, atol=1e-4)
 
 
@@ -99,6 +99,35 @@ def identity(**shapes):
     """A graph that returns its inputs, each of them called ``..._x``."""
     nodes = [helper.make_node("Identity", [name], [f"{name}_x"]) for name in shapes]
     return graph_model(nodes, *([port(name + end, *of) for name, of in shapes.items()] for end in ("", "_x")))
+
+
+@pytest.mark.filterwarnings("ignore:policy.*one robot after the other")
+@pytest.mark.parametrize("batch", ["n", 1])
+@pytest.mark.parametrize("last", ["Identity", "Softsign"])
+def test_inputs_are_columns_of_the_row_states_come_back_and_other_outputs_are_named(tmp_path, batch, last):
+    sizes = {"start": [1], "end": [2], "axis": [1]}
+    nodes = [
+        helper.make_node("Slice", ["past", "start", "end", "axis"], ["newer"]),  # past: (batch, 2, 3)
+        helper.make_node("Unsqueeze", ["speed", "axis"], ["now"]),
+        helper.make_node("Concat", ["newer", "now"], ["past_out"], axis=1),
+        helper.make_node("ReduceMean", ["past_out"], ["mean"], axes=[1], keepdims=0),
+        helper.make_node("Concat", ["command", "mean"], ["both"], axis=-1),
+        helper.make_node(last, ["both"], ["actions"]),
+    ]
+    shapes = {"command": [batch, 2], "past": [batch, 2, 3], "speed": [batch, 3]}
+    outputs = {"mean": [batch, 3], "past_out": [batch, 2, 3], "actions": [batch, 5]}
+    ports = [[port(*item) for item in items.items()] for items in (shapes, outputs)]
+    model = graph_model(nodes, *ports, [numpy_helper.from_array(np.array(v), name) for name, v in sizes.items()])
+    with pytest.warns(UserWarning, match=r"policy\.onnx' returns more than actions: mean"):
+        policy = load_onnx(save(tmp_path / "policy.onnx", model), (5, 5), "cpu")
+    assert is_graph_safe(policy) == (last == "Identity")
+    policy.reset(torch.ones(2, dtype=torch.bool))
+    rows = torch.tensor([[1.0, 2.0, 4.0, 6.0, 8.0], [0.0, 0.0, 2.0, 2.0, 2.0]])
+    expected = rows * torch.tensor([1, 1, 0.5, 0.5, 0.5])  # the mean of speed and the zeros before the episode
+    function = torch.nn.functional.softsign if last == "Softsign" else torch.clone
+    torch.testing.assert_close(policy(rows), function(expected))
+    policy.reset(torch.tensor([True, False]))
+    torch.testing.assert_close(policy(rows), function(torch.stack([expected[0], rows[1]])))  # the other's speed again
 
 
 MODELS = {
