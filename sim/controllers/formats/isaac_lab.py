@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from sim.controllers.formats.rsl_rl import read_activation
-from sim.controllers.formats.source import Source, collapse, make_term
+from sim.controllers.formats.source import Source, collapse, find_checkpoint, make_term
 from sim.files.settings import read_yaml
 from sim.robots.compiled import PER_JOINT
-from sim.robots.robot import RobotCfg
 from sim.robots.user import per_joint
 
 _ISAAC_LAB_TERMS = {
@@ -41,40 +40,35 @@ class IsaacLab:
         """Settings of env.yaml and agent.yaml; returns the exported network, else the last checkpoint."""
         source.file = path / "params" / "env.yaml"
         env = read_yaml(source.file)
+        agent_file = path / "params" / "agent.yaml"
+        agent = read_yaml(agent_file) if agent_file.is_file() else {}
         articulation = env["scene"]["robot"]
+        source.find_model_file((articulation.get("spawn") or {}).get("asset_path"))
         pose = articulation["init_state"]["joint_pos"]
         pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
         source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
         _read_actuators(articulation["actuators"], source)
         source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
         commands = [command for command in (env.get("commands") or {}).values() if isinstance(command, dict)]
-        ranges = [command.get("ranges") or {} for command in commands]
-        speed = next((limits["lin_vel_x"][1] for limits in ranges if "lin_vel_x" in limits), 0.0)
-        if 0.0 < speed < RobotCfg.speed:
-            source.set(speed=speed, reason=f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here")
-            source.set(max_duration_s=round(15.0 / speed, 1), reason="in proportion")
-        joint_order = _read_action(env["actions"], path, source)
-        group = env["observations"]["policy"]
-        terms = {name: term for name, term in group.items() if isinstance(term, dict)}
-        common = group.get("history_length")
-        lengths = [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
-        rows = [_read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
+        source.set_speed(
+            next((ranges for command in commands if "lin_vel_x" in (ranges := command.get("ranges") or {})), {})
+        )
+        joint_order = _read_action(env, path, source, agent.get("clip_actions"))
+        observation_groups = agent.get("obs_groups") or {}
+        rows, lengths = [], []
+        for group_name in observation_groups.get("actor") or observation_groups.get("policy") or ["policy"]:
+            group = env["observations"][group_name]
+            terms = {name: term for name, term in group.items() if isinstance(term, dict)}
+            common = group.get("history_length")
+            lengths += [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
+            rows += [_read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
         source.set_history(rows, lengths)
         reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
         source.set(observation=rows, reason=reason)
-        agent_file = path / "params" / "agent.yaml"
-        agent = read_yaml(agent_file) if agent_file.is_file() else {}
-        if agent.get("clip_actions") is not None:
-            source.set(action_clip=agent["clip_actions"])
-        for name in ("policy.pt", "policy.onnx"):
-            if (exported := path / "exported" / name).is_file():
-                return exported
-        checkpoints = sorted(path.glob("model_*.pt"), key=lambda file: int(re.sub(r"\D", "", file.stem) or 0))
-        if not checkpoints:
-            raise ValueError("it has no weights, expected exported/policy.pt or model_*.pt")
-        if (activation := read_activation(agent)) is not None:
+        weights = find_checkpoint(path, "exported/policy.pt", "exported/policy.onnx")
+        if weights.parent == path and (activation := read_activation(agent)) is not None:
             source.set(activation=activation)
-        return checkpoints[-1]
+        return weights
 
 
 def _read_actuators(groups: dict[str, Any], source: Source) -> None:
@@ -94,7 +88,8 @@ def _read_actuators(groups: dict[str, Any], source: Source) -> None:
         group |= _IDEAL_DRIVE if name in ideal else {}
         joints = _match_joints(group["joint_names_expr"], source.joints)
         for key, values in values_by_key.items():
-            value = group.get(f"{key}_sim") if group.get(key) is None else group[key]
+            names = (key, f"actuator_{key}", f"joint_{key}", f"{key}_sim")
+            value = next((group[name] for name in names if group.get(name) is not None), None)
             values |= zip(joints, per_joint(value, joints, f"{source.file}: {name}.{key}", partly=True), strict=True)
     for key, values in values_by_key.items():
         without = [joint for joint, value in values.items() if value is None]
@@ -119,35 +114,50 @@ def _match_joints(patterns: Any, joints: Sequence[str], keep_pattern_order: Any 
     return list(named) if keep_pattern_order else [joint for joint in joints if joint in named]
 
 
-def _read_action(actions: dict[str, Any], path: Path, source: Source) -> list[str]:
-    """Scale, offset and joints of the action; returns the order of all joints, which env.yaml does not say."""
+def _order_joints(env: dict[str, Any], path: Path, source: Source) -> tuple[list[str], str]:
+    """All joints in the order of the simulation, with the reason if env.yaml does not say it."""
     if descriptors := sorted(path.rglob("*IO_descriptors.yaml")):
-        joint_order = read_yaml(descriptors[0])["articulations"]["robot"]["joint_names"]
-        reason = ""
-    else:
-        model = source.model
-        names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
+        return read_yaml(descriptors[0])["articulations"]["robot"]["joint_names"], ""
+    is_newton = "newton" in str(env["sim"].get("physics")).lower()
+    ordering = env["scene"]["robot"].get("joint_ordering") or ("mjwarp" if is_newton else "physx")
+    if isinstance(ordering, list):
+        return ordering, ""
+    if ordering not in ("physx", "mjwarp"):
+        raise ValueError(f"{source.file}: joint_ordering must be physx, mjwarp or a list of joints, got {ordering}")
+    if ordering == "mjwarp":
+        return list(source.joints), "that of the model, as Newton orders joints; IO_descriptors.yaml would say it"
+    paths = sorted(source.joint_paths(), key=lambda names: (len(names), names))  # a body's children by name
+    return [names[-1] for names in paths], "breadth first, as PhysX orders joints; IO_descriptors.yaml would say it"
 
-        def path_to(body: int) -> list[str]:
-            return [*path_to(int(model.body_parentid[body])), names[body]] if body in names else []
 
-        paths = sorted(map(path_to, names), key=lambda joints: (len(joints), joints))
-        joint_order = [joints[-1] for joints in paths]  # from the base outwards, a body's children by name
-        reason = "breadth first, as Isaac Lab orders joints; IO_descriptors.yaml would say it"
+def _read_action(env: dict[str, Any], path: Path, source: Source, limit: float | None) -> list[str]:
+    """Scale, offset, limits and joints of the action, which ``limit`` clips; returns the order of all joints."""
+    actions = env["actions"]
+    joint_order, reason = _order_joints(env, path, source)
     kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items() if term is not None}
     if list(kinds.values()) != ["JointPositionAction"]:
         raise ValueError(f"{source.file}: actions must be one JointPositionAction, got {kinds}")
     (name,) = kinds
     term = actions[name]
     label = f"{source.file}: actions.{name}"
-    if term.get("clip") is not None:
-        raise ValueError(f"{label}.clip limits targets, which is not supported: give joints that range")
     joints = _match_joints(term["joint_names"], joint_order, term.get("preserve_order"))
     source.set_joints(joints, reason)
-    source.set(action_scale=collapse(per_joint(term["scale"], joints, f"{label}.scale")))
+    scale = per_joint(term["scale"], joints, f"{label}.scale")
+    source.set(action_scale=collapse(scale))
+    pose = dict(zip(source.joints, per_joint(source.settings["default_joint_pos"], source.joints, label), strict=True))
+    offset = [pose[joint] for joint in joints]
     if not term.get("use_default_offset", True):
-        offset = per_joint(term["offset"], joints, f"{label}.offset", partly=True)
-        source.set(action_offset=[angle or 0.0 for angle in offset])
+        offset = [angle or 0.0 for angle in per_joint(term["offset"], joints, f"{label}.offset", partly=True)]
+        source.set(action_offset=offset)
+    if limit is not None:
+        source.set(action_clip=limit)
+    if term.get("clip") is not None:
+        ranges = [
+            angles or [-np.inf, np.inf] for angles in per_joint(term["clip"], joints, f"{label}.clip", partly=True)
+        ]
+        limits = (np.array(ranges) - np.c_[offset]) / np.c_[scale]
+        limits = np.clip(limits, *(-1e9, 1e9) if limit is None else (-limit, limit)).tolist()
+        source.set(action_clip=limits, reason="the range of targets as one of actions, which limits last_action, too")
     return joint_order
 
 

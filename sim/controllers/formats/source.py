@@ -1,5 +1,6 @@
 """What a format of sources reads: settings of a robot and its controller, with the reasons of guesses."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,6 +11,7 @@ import numpy as np
 
 from sim.robots.compiled import PER_JOINT, RobotFile, joint_names, read_robot_file
 from sim.robots.model_files import find_above, find_robot_of_scene
+from sim.robots.robot import RobotCfg
 
 _NAMES_BY_TERM = {
     "lin_vel": ("lin_vel", "base_lin_vel"),
@@ -60,15 +62,10 @@ class Source:
         """Joints of the model, in its order."""
         return joint_names(self.model)
 
-    @property
-    def home(self) -> list[float] | None:
-        """The model's home pose [rad], if it has one."""
-        return self.robot_file.home
-
     def find_model_file(self, name: Any) -> None:
         """Takes the model that the source names, if the user names none and it is here."""
-        if self.model_file is None and isinstance(name, str):
-            model_file = find_above(name, self.file.parent)
+        if self.model_file is None and str(name).endswith((".urdf", ".xml", ".mjcf")):
+            model_file = find_above(str(name), self.file.parent)
             self.model_file = model_file and find_robot_of_scene(model_file)
 
     def set(self, reason: str = "", **settings: Any) -> None:
@@ -105,6 +102,22 @@ class Source:
         if max(lengths) > 1:
             self.set(history={"length": max(lengths), "newest": "last", "by": "term", "fill": "first"})
 
+    def set_speed(self, ranges: Mapping[str, Any]) -> None:
+        """Stores the fastest forward command of a training [m/s], if it is slower than that of a crossing."""
+        fastest = ranges["lin_vel_x"][1] if "lin_vel_x" in ranges else 0.0
+        if 0.0 < fastest < RobotCfg.speed:
+            self.set(speed=fastest, reason=f"the fastest that it was trained for; {RobotCfg.speed:g} is usual here")
+
+    def joint_paths(self) -> list[list[str]]:
+        """The names of joints from the base to each joint."""
+        model = self.model
+        names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
+
+        def path_to(body: int) -> list[str]:
+            return [*path_to(int(model.body_parentid[body])), names[body]] if body in names else []
+
+        return [path_to(body) for body in names]
+
     def find_imu(self) -> list[float] | None:
         """Position of the base's only site that is called after an IMU [m], shape (3,)."""
         model = self.model
@@ -122,6 +135,17 @@ def make_term(name: str, scale: Any = None, **fields: Any) -> dict[str, Any]:
     if scale is not None and not np.all(np.equal(scale, 1.0)):
         fields = {"scale": scale, **fields}
     return {"term": name, **{key: value for key, value in fields.items() if value is not None}}
+
+
+def find_checkpoint(folder: Path, *exported: str) -> Path:
+    """The network that a run exported, whose patterns are tried in turn, else its last checkpoint."""
+    files = next(filter(None, (sorted(folder.glob(pattern)) for pattern in exported)), [])
+    if len(files) > 1:
+        raise ValueError(f"it must have one exported network, got {', '.join(map(str, files))}")
+    checkpoints = sorted(folder.glob("model_*.pt"), key=lambda file: int(re.sub(r"\D", "", file.stem) or 0))
+    if not files + checkpoints:
+        raise ValueError(f"it has no weights, expected {', '.join(exported)} or model_*.pt in {folder}")
+    return [*checkpoints, *files][-1]
 
 
 def find_weights(folder: Path, name: str) -> Path:

@@ -24,7 +24,8 @@ class Weights:
         if activation := getattr(getattr(network, "head", network), "activation", None):
             source.set(activation=activation)
         pose = f"an angle of each joint [rad], its pose at action 0: {', '.join(source.joints)}"
-        source.set(default_joint_pos=source.home, reason="" if source.home else pose)
+        home = source.robot_file.home
+        source.set(default_joint_pos=home, reason="" if home else pose)
         if not source.model.nu or not source.model.actuator_biasprm[:, 1].any():
             for name, unit in (("stiffness", "N m/rad"), ("damping", "N m s/rad")):
                 source.set(**{name: None}, reason=f"a gain of each joint, or one number [{unit}]")

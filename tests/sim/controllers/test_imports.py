@@ -1,5 +1,6 @@
 """What trainings and vendors leave becomes a robot and a controller, which load and mean the same."""
 
+import json
 import re
 
 import onnx
@@ -41,6 +42,16 @@ MJLAB = {
     "observation_terms_scale": "1.0,0.2,1.0,1.0,1.0,1.0,1.0", "observation_terms_history_length": "0,3,0,0,0,0,0",
     "observation_terms_clip": "-5.0;5.0,-inf;inf,-inf;inf,-inf;inf,-inf;inf,-inf;inf,-inf;inf", "run_path": "local",
     "command_names": "twist",
+}  # fmt: skip
+LEGGED_GYM = {
+    "env": {"num_observations": 36}, "sim": {"dt": 0.005}, "asset": {"file": "{LEGGED_GYM_ROOT_DIR}/dog.urdf"},
+    "init_state": {"default_joint_angles": dict(zip(RIGHT_FIRST, POSE, strict=True))},
+    "control": {"control_type": "P", "stiffness": {"hip": 20.0, "knee": 30.0, "HR_knee": 35.0},
+                "damping": {"hip": 0.5, "knee": 0.6}, "action_scale": 0.25, "decimation": 4},
+    "commands": {"ranges": {"lin_vel_x": [-0.5, 0.5]}},
+    "terrain": {"measured_points_x": [-0.1, 0.1], "measured_points_y": [0.0]},
+    "normalization": {"clip_observations": 100.0, "clip_actions": 10.0, "obs_scales": {
+        "lin_vel": 2.0, "ang_vel": 0.25, "dof_pos": 1.0, "dof_vel": 0.05, "height_measurements": 5.0}},
 }  # fmt: skip
 ISAAC = """
 sim: {dt: 0.005, gravity: !!python/tuple [0.0, 0.0, -9.81]}
@@ -100,6 +111,14 @@ def rl_sar(folder, width=2 * 33, **changes):
 def deployment(folder, **changes):
     write(folder / "policy.pt", 35)
     return write(folder / "dog.yaml", DEPLOYMENT | changes)
+
+
+def legged_gym(folder, width=36, old=None, row=None, **changes):
+    write(folder / "policy_1.pt", width)
+    env = {"env": {"num_observations": width, "num_one_step_observations": row}}
+    if old:
+        changes[old] = LEGGED_GYM[old] | changes[old]
+    return write(folder / "cfg.json", json.dumps(LEGGED_GYM | env | changes))
 
 
 def mjlab(folder, **changes):
@@ -164,6 +183,31 @@ def test_weights_and_the_model_of_a_deployment_may_be_in_folders_above(tmp_path)
         import_controller(source, None, tmp_path / "mine" / "cat")
 
 
+HIM = ["command", "ang_vel", "gravity", "joint_pos", "joint_vel", "last_action"]
+
+
+@pytest.mark.parametrize(
+    ("width", "row", "terms"),
+    [
+        (33, None, BLIND_WITH_CLOCK[:-1]),
+        (35, None, BLIND_WITH_CLOCK),
+        (36, None, ["lin_vel", *BLIND_WITH_CLOCK[:-1]]),
+        (38, None, ["lin_vel", *BLIND_WITH_CLOCK[:-1], "scan"]),
+        (99, 33, HIM),
+    ],
+)
+def test_the_width_of_a_training_of_legged_gym_says_what_it_sees(tmp_path, width, row, terms):
+    robot, controller = imported(legged_gym(tmp_path / "run", width, row=row), tmp_path)
+    assert [term.term for term in controller.observation] == terms
+    scales = {"lin_vel": 2.0, "ang_vel": 0.25, "command": (2.0, 2.0, 0.25), "joint_vel": 0.05, "scan": 5.0}
+    assert [term.scale for term in controller.observation] == [scales.get(term, 1.0) for term in terms]
+    assert (controller.history is None) == (row is None)
+    assert (robot.default_joint_pos, robot.damping, robot.speed) == (IN_FILE, (0.5, 0.6) * 4, 0.5)
+    assert robot.stiffness == (20.0, 30.0) * 2 + (20.0, 30.0, 20.0, 35.0)  # HL, HR; the longer name comes later
+    assert (controller.joints, controller.action_clip) == (None, 10.0)  # FL, FR, HL, HR is the order of names, too
+    assert robot.scan_x == ((-0.1, 0.1) if "scan" in terms else ())
+
+
 def test_the_metadata_of_mjlab_are_read(tmp_path):
     robot, controller = imported(mjlab(tmp_path), tmp_path)
     assert (robot.stiffness, robot.default_joint_pos) == ((20.0,) * 8, (0.6, -1.2) * 4)
@@ -176,7 +220,7 @@ def test_the_metadata_of_mjlab_are_read(tmp_path):
 def test_a_run_of_isaac_lab_is_read(tmp_path):
     robot, controller = imported(isaac_lab(tmp_path / "run"), tmp_path)
     assert (robot.default_joint_pos, robot.stiffness) == ((0.6, -1.2) * 2 + (0.6, -1.1) * 2, (25.0, 35.0) * 4)
-    assert (robot.effort_limit, robot.speed, robot.max_duration_s) == ((20.0, 30.0) * 4, 0.5, 30.0)
+    assert (robot.effort_limit, robot.speed) == ((20.0, 30.0) * 4, 0.5)
     assert robot.saturation_effort is None and robot.velocity_limit is None  # which without a motor mean nothing here
     assert (controller.joints, controller.action_scale) == (HIPS_FIRST, (0.125,) * 4 + (0.25,) * 4)
     assert [term.term for term in controller.observation] == ["lin_vel", "command", "joint_pos", "last_action", "scan"]
@@ -201,6 +245,23 @@ def test_motors_and_delays_of_isaac_lab_are_kept_and_descriptors_say_the_order_o
     assert "a guess: the mean of the delays of hips (1 to 6)" in lines and "simulated as PD gains" not in lines
     assert "# armature = ...  # fill in: a value of each joint: FL_hip 0.01" in lines  # of the knees nobody says it
     assert "the friction of hips is left out" in lines
+
+
+def test_a_run_of_isaac_lab_3_is_read(tmp_path):
+    source = isaac_lab(tmp_path / "run", "effort_limit: 20.0", "actuator_effort_limit: 20.0")
+    env, agent = source / "params" / "env.yaml", source / "params" / "agent.yaml"
+    text = env.read_text().replace("effort_limit_sim: 30.0", "joint_effort_limit: 30.0")
+    text = text.replace("sim: {", "sim: {physics: {class_type: 'isaaclab_newton.physics:NewtonManager'}, ")
+    text = text.replace("clip: null}\n", "clip: {.*_hip: [0.1, 1.1]}}\n").replace(
+        "    height_scan:", "  scan:\n    height_scan:"
+    )
+    env.write_text(text)
+    agent.write_text("{clip_actions: 5.0, obs_groups: {actor: [scan, policy], critic: [policy]}}")
+    robot, controller = imported(source, tmp_path)
+    assert (robot.effort_limit, controller.joints) == ((20.0, 30.0) * 4, None)  # Newton keeps the order of the file
+    assert [term.term for term in controller.observation] == ["scan", "lin_vel", "command", "joint_pos", "last_action"]
+    # A hip's target is 0.6 + 0.125 action; a knee's has no range.
+    assert controller.action_clip == ((pytest.approx(-4.0), pytest.approx(4.0)), (-5.0, 5.0)) * 4
 
 
 def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_taken(tmp_path, capsys):
@@ -233,6 +294,9 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (rl_sar, {"joint_mapping": [9] * 8}, "must be a controller of rl_sar"),
         (deployment, {"num_obs": 40}, "num_obs"),
         (deployment, {"num_actions": 7}, "num_actions"),
+        (legged_gym, {"old": "control", "control": {"control_type": "T"}}, "control_type"),
+        (legged_gym, {"old": "control", "control": {"hip_scale_reduction": 0.5}}, "hip_scale_reduction"),
+        (legged_gym, {"old": "control", "control": {"stiffness": {"hip": 20.0}}}, "none of FL_knee"),
         (mjlab, {"joint_damping": "much"}, "run.onnx must be a controller of mjlab"),
         (deployment, {"leg_joint2motor_idx": []}, "leg_joint2motor_idx"),
         (mjlab, {"observation_names": "base_lin_vel,height_scan"}, "height_scan"),
@@ -241,7 +305,8 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (isaac_lab, {"old": "JointPositionAction", "new": "JointVelocityAction"}, "JointVelocityAction"),
         (isaac_lab, {"old": "{.*_hip: 0.6, F._knee: -1.2, H._knee: -1.1}", "new": "{.*_toe: 1}"}, ".*_toe matches"),
         (isaac_lab, {"old": "decimation: 4", "new": ""}, "it has no 'decimation'"),
-        (isaac_lab, {"old": "clip: null}", "new": "clip: [-1, 1]}"}, "clip"),
+        (isaac_lab, {"old": "clip: null}", "new": "clip: {.*_toe: [-1, 1]}}"}, "clip"),
+        (isaac_lab, {"old": "init_state:", "new": "joint_ordering: robot_schema\n    init_state:"}, "joint_ordering"),
         (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),
         (lambda folder: folder, {}, "a run of Isaac Lab (a folder with params/env.yaml), or a deployment of"),
     ],

@@ -1,0 +1,71 @@
+"""A training of legged_gym or one of its forks: its configuration as YAML or JSON."""
+
+from pathlib import Path
+
+from sim.controllers.formats.rsl_rl import read_activation
+from sim.controllers.formats.source import BLIND_TERMS, CLOCK_PERIOD, Source, find_checkpoint, make_term
+from sim.files.settings import YAML_SUFFIXES, read_yaml
+
+_CONTROL = ("control_type", "stiffness", "damping", "action_scale", "decimation")
+_HIM_TERMS = ("command", "ang_vel", "gravity", "joint_pos", "joint_vel", "last_action")
+
+
+class LeggedGym:
+    """Reads the configuration of an environment, classes as tables; the width of its observation says the terms."""
+
+    label = "a training of legged_gym (its configuration as YAML or JSON)"
+
+    def matches(self, path: Path) -> bool:
+        """Whether it is a YAML or JSON with the scales of legged_gym's observation."""
+        is_text = path.suffix in (*YAML_SUFFIXES, ".json") and path.is_file()
+        return is_text and "obs_scales" in (read_yaml(path).get("normalization") or ())
+
+    def read(self, path: Path, source: Source) -> Path:
+        """Settings of the configuration; returns the exported network beside it, else the last checkpoint."""
+        cfg = read_yaml(path)
+        control, normalization, terrain = cfg["control"], cfg["normalization"], cfg.get("terrain") or {}
+        source.find_model_file(cfg["asset"]["file"])
+        source.refuse_unknown(control, _CONTROL)
+        if control.get("control_type", "P") != "P":
+            raise ValueError(f"control_type must be P, joint positions, got {control['control_type']}")
+        for name in ("stiffness", "damping"):
+            gains = {joint: [gain for key, gain in control[name].items() if key in joint] for joint in source.joints}
+            if without := [joint for joint, matches in gains.items() if not matches]:
+                raise ValueError(f"{name} must have a part of every joint's name, got none of {', '.join(without)}")
+            source.set("", **{name: [matches[-1] for matches in gains.values()]})  # of several the last counts there
+        angles = cfg["init_state"]["default_joint_angles"]
+        source.set(default_joint_pos=[angles[joint] for joint in source.joints])
+        source.set(physics_dt=cfg["sim"]["dt"], decimation=control["decimation"], action_scale=control["action_scale"])
+        source.set(action_clip=normalization["clip_actions"], observation_clip=normalization["clip_observations"])
+        source.set_speed((cfg.get("commands") or {}).get("ranges") or {})
+        joints = [names[-1] for names in sorted(source.joint_paths())]
+        source.set_joints(joints, "a leg after the other, legs by name, as Isaac Gym orders joints")
+        width, row = cfg["env"]["num_observations"], cfg["env"].get("num_one_step_observations")
+        scales, blind = normalization["obs_scales"], 9 + 3 * len(joints)
+        factors = {"joint_pos": scales["dof_pos"], "joint_vel": scales["dof_vel"], "ang_vel": scales["ang_vel"]}
+        factors |= {"lin_vel": scales["lin_vel"], "command": [scales["lin_vel"]] * 2 + [scales["ang_vel"]]}
+        grid = {axis: terrain.get(f"measured_points_{axis}") or [] for axis in "xy"}
+        clock = make_term("clock", period_s=CLOCK_PERIOD)
+        scan = make_term("scan", scales.get("height_measurements"), **grid, order="y fastest", offset=0.5, clip=1.0)
+        layouts = {
+            blind: (BLIND_TERMS, [], "unitree_rl_gym"),
+            blind + 2: (BLIND_TERMS, [clock], "unitree_rl_gym, with the period of its clock"),
+            blind + 3: (("lin_vel", *BLIND_TERMS), [], "legged_gym"),
+            blind + 3 + len(grid["x"]) * len(grid["y"]): (
+                ("lin_vel", *BLIND_TERMS),
+                [scan] * bool(grid["x"]),
+                "legged_gym",
+            ),
+        }
+        if row == blind:
+            layouts[width] = (_HIM_TERMS, [], "HIMLoco")
+            history = {"length": width // row, "newest": "first", "by": "row", "fill": "zeros"}
+            source.set(history=history, reason="as in HIMLoco")
+        names, others, author = layouts.get(width, ((), [], ""))
+        terms = [make_term(name, factors.get(name)) for name in names] + others
+        gap = f"its {width} columns in its order, with scale; no usual observation is so wide"
+        source.set(observation=terms or None, reason=f"the order of {author}, by its {width} columns" if terms else gap)
+        weights = find_checkpoint(path.parent, "policy*.pt")
+        if weights.name.startswith("model_"):
+            source.set(activation=read_activation(cfg) or "elu", reason="elu is usual in legged_gym")
+        return weights
