@@ -15,7 +15,7 @@ import warp as wp
 
 from kernels.episode import Episodes
 from kernels.launch import kernel_over
-from kernels.observation import Noise
+from kernels.observation import Noise, Sensors
 
 Effects = tuple[tuple[Any, int], ...]
 """Warp functions of conditions, each with the column of its first number."""
@@ -71,7 +71,7 @@ class DisturbedStep:
 
     memory: Disturbed
     episodes: Episodes
-    num_joints: int
+    sensors: Sensors
     dt: float
     """Length of the steps that the episodes count [s]."""
     every: int

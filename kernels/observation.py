@@ -2,7 +2,9 @@
 
 Columns, for J joints and S scan points: base linear velocity (3, base frame, x 2), base angular velocity (3, base
 frame, x 0.25), projected gravity (3), command vx, vy, yaw rate (3, x 2, 2, 0.25), joint positions minus default (J),
-joint rates (J, x 0.05), last action (J), height scan (S): clip(base height - 0.5 m - ground height, -1, 1) x 5.
+joint rates (J, x 0.05), last action (J), height scan (S): clip(base height - 0.5 m - ground height, -1, 1) x 5. Then
+what a robot's ``senses`` name: base position, world-local [m], and quaternion wxyz (7); size of the contact force on
+each foot geom [N] (x 0.01); joint torques of the last physics step [N m] (J, x 0.01).
 """
 
 import warp as wp
@@ -17,6 +19,7 @@ ANG_VEL_SCALE = wp.constant(0.25)
 JOINT_VEL_SCALE = wp.constant(0.05)
 SCAN_SCALE = wp.constant(5.0)
 SCAN_OFFSET = wp.constant(0.5)
+FORCE_SCALE = wp.constant(0.01)
 ACTION_LIMIT = wp.constant(100.0)
 OBSERVATION_LIMIT = wp.constant(100.0)
 
@@ -31,6 +34,12 @@ class Sensors:
     """Scan points ahead of the base in its yaw frame [m], shape (num_scan_points,)."""
     scan_y: wp.array[float]
     """Scan points left of the base in its yaw frame [m], shape (num_scan_points,)."""
+    num_pose: int
+    """Columns of the base's pose, 7 or 0."""
+    foot_columns: wp.array[int]
+    """Columns in ``geom_force`` of the feet whose contact is observed, shape (num_feet,) or (0,)."""
+    torque_columns: wp.array[int]
+    """Columns in ``joint_torque`` of the joints whose torque is observed, shape (num_joints,) or (0,)."""
 
 
 @wp.struct
@@ -67,8 +76,22 @@ def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: 
 
 
 @wp.func
-def noise_width(noise: Noise, k: int, num_joints: int) -> float:
-    """Half width of the noise of column ``k`` of an observation."""
+def _sense_column(step: RobotStep, sensors: Sensors, env: int, k: int) -> float:
+    if k < sensors.num_pose:
+        if k < 3:
+            return step.joint_q[env, k]
+        return step.joint_q[env, 3 + k % 4]  # w is the last there: column 3 is w, 4 to 6 are xyz
+    foot = k - sensors.num_pose
+    num_feet = sensors.foot_columns.shape[0]
+    if foot < num_feet:
+        return wp.length(step.geom_force[env, sensors.foot_columns[foot]]) * FORCE_SCALE
+    return step.joint_torque[env, sensors.torque_columns[foot - num_feet]] * FORCE_SCALE
+
+
+@wp.func
+def noise_width(noise: Noise, sensors: Sensors, k: int) -> float:
+    """Half width of the noise of column ``k`` of an observation: a small turn by a is half of a in a quaternion."""
+    num_joints = sensors.default_joint_pos.shape[0]
     if k < 3:
         return noise.lin_vel * LIN_VEL_SCALE
     if k < 6:
@@ -83,7 +106,12 @@ def noise_width(noise: Noise, k: int, num_joints: int) -> float:
         return noise.joint_vel * JOINT_VEL_SCALE
     if k < NUM_BASE_COLUMNS + 3 * num_joints:
         return 0.0
-    return noise.scan * SCAN_SCALE
+    sense = k - NUM_BASE_COLUMNS - 3 * num_joints - sensors.scan_x.shape[0]
+    if sense < 0:
+        return noise.scan * SCAN_SCALE
+    if sense >= 3 and sense < sensors.num_pose:
+        return 0.5 * noise.gravity
+    return 0.0
 
 
 @kernel_over("observation_out")
@@ -96,7 +124,7 @@ def write_observation(
     noise_seed: wp.array[int],
     observation_out: wp.array2d[float],
 ):
-    """Grid (num_envs, 12 + 3 * num_joints + num_scan_points): write one row an environment (columns: module docstring).
+    """Grid (num_envs, observation_size): write one row an environment (columns: module docstring).
 
     The command is in the base's yaw frame; ``noise_seed`` is one integer that the caller advances, shape (1,).
     """
@@ -112,9 +140,11 @@ def write_observation(
         column = step.joint_qd[env, 6 + joint - num_joints] * JOINT_VEL_SCALE
     elif joint < 3 * num_joints:
         column = step.action[env, joint - 2 * num_joints]
-    else:
+    elif joint < 3 * num_joints + sensors.scan_x.shape[0]:
         column = _scan_column(step.joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
-    width = noise_width(noise, k, num_joints)
+    else:
+        column = _sense_column(step, sensors, env, joint - 3 * num_joints - sensors.scan_x.shape[0])
+    width = noise_width(noise, sensors, k)
     if width > 0.0:
         state = wp.rand_init(noise_seed[0], env * observation_out.shape[1] + k)
         column += width * wp.randf(state, -1.0, 1.0)

@@ -222,6 +222,10 @@ def restart_episodes(
         step_out.joint_qd[env, k] = com_velocity[k]
         step_out.joint_qd[env, 3 + k] = ang_vel[k]
     begin_episode(env, episodes_out)
+    for g in range(step_out.geom_force.shape[1]):
+        step_out.geom_force[env, g] = wp.vec3(0.0)
+    for j in range(step_out.joint_torque.shape[1]):
+        step_out.joint_torque[env, j] = 0.0
     if rewards_out.total.shape[0] == 0:
         return
     rewards_out.running[env] = 1

@@ -26,8 +26,6 @@ class Motion:
 
     step: RobotStep
     """Of its last physics step; the command is the one that the action followed."""
-    joint_torque: wp.array2d[float]
-    """Actuator torques [N m] in columns 6 and up, shape (num_envs, 6 + num_joints)."""
     dt: float
     """Control step [s]."""
     min_air_time_s: float
@@ -113,7 +111,7 @@ def torques(motion: Motion, rewards: Rewards, env: int) -> float:
     """Sum over the joints of the squared torque [N^2 m^2]."""
     total = float(0.0)
     for j in range(motion.step.action.shape[1]):
-        total += motion.joint_torque[env, 6 + j] * motion.joint_torque[env, 6 + j]
+        total += motion.step.joint_torque[env, 6 + j] * motion.step.joint_torque[env, 6 + j]
     return total
 
 

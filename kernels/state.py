@@ -19,6 +19,8 @@ class RobotStep:
     """As :func:`kernels.observation.apply_action` left it."""
     geom_force: wp.array2d[wp.vec3]
     geom_role: wp.array[int]
+    joint_torque: wp.array2d[float]
+    """Actuator torques [N m] in columns 6 and up, in the solver's order, shape (num_envs, 6 + num_joints)."""
     overflow: wp.array[int]
     """The solver's overflow bits of the step, shape (num_envs,)."""
     force_limit: float

@@ -186,14 +186,22 @@ class Simulation:
         self.joint_torque = self.solver.mjw_data.qfrc_actuator
         self.overflow = self.solver.mjw_data.overflow
         self.base_com = wp.vec3(*self.model.body_com.numpy()[0])
-        scan_x, scan_y = robot.scan_points()
-        arrays = {"default_joint_pos": robot.default_joint_pos, "scan_x": scan_x, "scan_y": scan_y}
-        self.sensors = make_struct(Sensors, **{name: wp.array(row, dtype=float) for name, row in arrays.items()})
         # Columns of joints, bodies and targets in mujoco_warp's data, the same for all robots.
         solver: Any = self.solver
         columns = solver.mj_q_start.numpy()[1 : 1 + robot.num_joints]  # the first is the base's
         moved = solver.mj_model.jnt_qposadr[solver.mj_model.actuator_trnid[:, 0]]
         joints = [int(np.flatnonzero(columns == column)[0]) for column in moved]
+        num_pose, num_feet, num_torques = robot.sense_sizes
+        scan_x, scan_y = robot.scan_points()
+        arrays = {"default_joint_pos": robot.default_joint_pos, "scan_x": scan_x, "scan_y": scan_y}
+        feet = np.arange(len(robot.geom_names))[len(robot.geom_names) - num_feet :]
+        self.sensors = make_struct(
+            Sensors,
+            num_pose=num_pose,
+            foot_columns=wp.array(feet, dtype=int),
+            torque_columns=wp.array(columns[:num_torques] - 1, dtype=int),
+            **{name: wp.array(row, dtype=float) for name, row in arrays.items()},
+        )
         bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
         self._coordinates = make_struct(
             SolverState,
@@ -277,7 +285,7 @@ class Simulation:
     def disturb(self, episodes: Episodes, dt: float, observation: Any) -> None:
         """Push robots and disturb observations as the conditions of their terrains say (:meth:`observe`)."""
         if self.disturbed is not None:
-            values = {"dt": dt, "every": round(self.robot.control_dt / dt), "num_joints": self.robot.num_joints}
+            values = {"dt": dt, "every": round(self.robot.control_dt / dt)}
             values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
             make_disturb(disturb_effects())(make_struct(DisturbedStep, self, **values))
 
@@ -374,7 +382,6 @@ class Reward:
             Motion,
             cfg,
             step=step,
-            joint_torque=sim.joint_torque,
             default_joint_pos=sim.sensors.default_joint_pos,
             dt=robot.control_dt,
             joint_lower=wp.array(middle - half, dtype=float, device=sim.device),

@@ -1,6 +1,7 @@
 """A controller as data: a TOML file says what a network sees, and what its actions mean (docs/controllers.md)."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -11,17 +12,31 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from kernels.observation import ANG_VEL_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE, SCAN_OFFSET, SCAN_SCALE
+from kernels.observation import ANG_VEL_SCALE, FORCE_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE, SCAN_OFFSET, SCAN_SCALE
 from sim.controllers.formats.rsl_rl import ACTIVATIONS
 from sim.controllers.runner import is_graph_safe
-from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, read_toml, to_toml
-from sim.robots.robot import RobotCfg
+from sim.files.settings import (
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    from_builtins,
+    read_toml,
+    to_toml,
+)
+from sim.robots.robot import RobotCfg, needed_senses
 
 TERMS: dict[str, tuple[str, ...]] = {
     "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit",), "joint_pos": ("joints",),
-    "joint_vel": ("joints",), "last_action": (), "clock": ("period_s",), "scan": ("order", "x", "y", "offset"),
+    "joint_vel": ("joints",), "last_action": (), "clock": ("period_s", "order", "offset"),
+    "scan": ("order", "x", "y", "offset"), "constant": ("value",), "heading": (), "rpy": ("axes",), "quat": ("order",),
+    "base_pos": (), "contacts": ("threshold", "feet"), "torques": ("joints",),
 }  # fmt: skip
 """Fields of each term besides those of all terms; docs/controllers.md explains them."""
+_REQUIRED = {"clock": {"period_s"}, "scan": {"order"}, "constant": {"value"}, "rpy": {"axes"}, "quat": {"order"}}
+_AXES = ("roll", "pitch", "yaw")
+_CLOCK = "sin cos"
+_ORDERS = {"scan": "(x|y) fastest", "clock": "(sin|cos)( (sin|cos))?", "quat": "w x y z|x y z w"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,13 +59,23 @@ class Term:
     """Joints in this order; those that the controller moves if None."""
     period_s: PositiveFloat | None = None
     """Period of a clock [s]."""
-    order: Annotated[str, Meta(pattern="^(x fastest|y fastest)$")] | None = None
+    order: str | None = None
+    """Of a scan's points: "x fastest" or "y fastest"; of a quaternion: "w x y z" or "x y z w"; of a clock: "sin cos" of
+    all feet (if None), "cos sin", "sin" or "cos"."""
     x: tuple[float, ...] | None = None
     """Points of a scan ahead of the base, yaw frame [m]; the robot's ``scan_x`` if None."""
     y: tuple[float, ...] | None = None
     """Left of it [m]; the robot's ``scan_y`` if None."""
-    offset: float | None = None
-    """Subtracted from the height of the base over the ground [m]."""
+    offset: float | tuple[float, ...] | None = None
+    """Subtracted from the height of the base over the ground [m]; of a clock: the start of each foot in periods."""
+    value: float | tuple[float, ...] = 0.0
+    """Numbers that never change."""
+    axes: Annotated[str, Meta(pattern="^(roll|pitch|yaw)( (roll|pitch|yaw))*$")] | None = None
+    """Angles of the base that are seen, in their order."""
+    threshold: NonNegativeFloat | None = None
+    """A foot with a larger force [N] is 1, else 0; the force itself if None."""
+    feet: tuple[tuple[str, ...], ...] | None = None
+    """Geoms of each foot, whose forces count together; each of the robot's ``foot_geoms`` by itself if None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +92,16 @@ class History:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Wander:
+    """A slow sinusoid of joint targets. Its phase depends on the joint angles in an episode's first step alone."""
+
+    joints: tuple[str, ...]
+    amplitude: NonNegativeFloat | tuple[NonNegativeFloat, ...]
+    """Of all joints, or of each [rad]."""
+    period_s: PositiveFloat
+
+
+@dataclass(frozen=True, kw_only=True)
 class ControllerCfg:
     """What a ``controller.toml`` says."""
 
@@ -76,6 +111,10 @@ class ControllerCfg:
     """Terms in the order of its columns."""
     joints: tuple[str, ...] | None = None
     """Joints that it moves, in its order; the others hold the robot's default pose. All of the robot if None."""
+    hold: dict[str, float] | None = None
+    """Angles that joints beside those hold instead [rad]."""
+    wander: Wander | None = None
+    """How joints beside those swing about the angles that they hold."""
     default: tuple[float, ...] | None = None
     """Pose that joint angles are relative to [rad]; the robot's if None."""
     action_scale: float | tuple[float, ...]
@@ -111,9 +150,14 @@ def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
         settings = ("term", "clip", "scale", "history", *TERMS[name])
         if unknown := sorted(item.keys() - settings):
             raise ValueError(f"{label} has no setting {', '.join(unknown)}: there are {', '.join(settings)}")
-        if missing := {"period_s", "order"} & {*TERMS[name]} - item.keys():
+        if missing := _REQUIRED.get(name, set()) - item.keys():
             raise ValueError(f"{label}: missing '{missing.pop()}'")
-        terms.append(from_builtins(Term, item, label))
+        term = from_builtins(Term, item, label)
+        if term.order is not None and not re.fullmatch(_ORDERS[name], term.order):
+            raise ValueError(f"{label}: order must be of the form {_ORDERS[name]}, got {term.order!r}")
+        if name == "scan" and isinstance(term.offset, tuple):
+            raise ValueError(f"{label}: offset must be a number [m], got {list(term.offset)}")
+        terms.append(term)
     return replace(from_builtins(ControllerCfg, content, str(path)), observation=tuple(terms))
 
 
@@ -144,6 +188,14 @@ class Sensed:
     scan: torch.Tensor
     """Height of the base over the ground at the scan points [m], clipped to -0.5..1.5; shape
     (num_envs, len(scan_x), len(scan_y)): ``robot.scan_x`` ahead and ``robot.scan_y`` left of the base, yaw frame."""
+    base_pos: torch.Tensor
+    """Position of the base, world-local frame [m], shape (num_envs, 3); (num_envs, 0) without the sense ``pose``."""
+    quat: torch.Tensor
+    """Quaternion wxyz of the base, base to world frame, shape (num_envs, 4); (num_envs, 0) without ``pose``."""
+    contacts: torch.Tensor
+    """Contact force on each of ``robot.foot_geoms`` [N], shape (num_envs, num_feet); (num_envs, 0) without it."""
+    torques: torch.Tensor
+    """Torques of the joints in the last physics step [N m], shape (num_envs, num_joints); (num_envs, 0) without it."""
 
 
 @lru_cache(maxsize=16)
@@ -156,8 +208,23 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
     """Splits a robot's observation rows, shape (num_envs, observation_size), into physical quantities."""
     if row.ndim != 2 or row.shape[1] != robot.observation_size:
         raise ValueError(f"row must have shape (num_envs, {robot.observation_size}), got {tuple(row.shape)}")
-    sizes = (3, 3, 3, 2, 1, *[robot.num_joints] * 3, robot.num_scan_points)
-    lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan = row.split(sizes, dim=1)
+    pose, feet, torques = robot.sense_sizes
+    sizes = (
+        3,
+        3,
+        3,
+        2,
+        1,
+        *[robot.num_joints] * 3,
+        robot.num_scan_points,
+        min(pose, 3),
+        max(pose - 3, 0),
+        feet,
+        torques,
+    )
+    lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan, *senses = row.split(
+        sizes, dim=1
+    )
     return Sensed(
         lin_vel=lin_vel / LIN_VEL_SCALE,
         ang_vel=ang_vel / ANG_VEL_SCALE,
@@ -167,7 +234,21 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
         joint_vel=joint_vel / JOINT_VEL_SCALE,
         last_action=last_action,
         scan=(scan / SCAN_SCALE + SCAN_OFFSET).reshape(len(row), len(robot.scan_x), len(robot.scan_y)),
+        base_pos=senses[0],
+        quat=senses[1],
+        contacts=senses[2] / FORCE_SCALE,
+        torques=senses[3] / FORCE_SCALE,
     )
+
+
+def _euler_angles(sensed: Sensed) -> torch.Tensor:
+    """Roll and pitch of the base, and its yaw where its pose is sensed [rad], shape (num_envs, 2 or 3)."""
+    x, y, z = sensed.gravity.unbind(1)
+    angles = [torch.atan2(-y, -z), torch.atan2(x, torch.hypot(y, z))]
+    if sensed.quat.shape[1]:
+        w, x, y, z = sensed.quat.unbind(1)
+        angles.append(torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    return torch.stack(angles, dim=1)
 
 
 class _Memory(NamedTuple):
@@ -176,6 +257,7 @@ class _Memory(NamedTuple):
     steps: torch.Tensor  # control steps of the episode, float, (num_envs, 1)
     action: torch.Tensor  # last output of the network, (num_envs, num_actions)
     sent: torch.Tensor  # outputs without effect yet, the newest first, (num_envs, action_delay_steps, num_actions)
+    phase: torch.Tensor  # of joints that wander, in periods, (num_envs, 1)
     past: torch.Tensor  # observations, the newest first, (num_envs, length, width)
 
 
@@ -189,7 +271,19 @@ class Described(torch.nn.Module):
         self.robot = robot
         self._path = path
         self.network: Any = None
+        if missing := {*needed_senses(term.axes or term.term for term in cfg.observation)} - {*robot.senses}:
+            senses = to_toml(sorted({*robot.senses, *missing}))
+            self._refuse(
+                f"observation needs the robot's {', '.join(sorted(missing))}: write into robot.toml senses = {senses}"
+            )
         self._moved = self._find_joints(cfg.joints)
+        wander = cfg.wander
+        self._wandering = () if wander is None else self._find_joints(wander.joints, "wander.joints")
+        if taken := {*self._moved} & {*self._wandering, *self._find_joints(tuple(cfg.hold or ()), "hold")}:
+            names = ", ".join(robot.joint_names[k] for k in sorted(taken))
+            self._refuse(f"hold and wander must name joints that the network does not move, got {names}")
+        if wander is not None and isinstance(wander.amplitude, tuple) and len(wander.amplitude) != len(wander.joints):
+            self._refuse(f"wander.amplitude must be one number or {len(wander.joints)}, got {len(wander.amplitude)}")
         self.num_actions = len(self._moved)
         for name in ("default", "action_scale", "action_offset", "action_clip"):
             values = getattr(cfg, name)
@@ -228,23 +322,32 @@ class Described(torch.nn.Module):
             return torch.tensor(np.array(values), dtype=torch.float32, device=device)
 
         robot_pose = self.robot.default_joint_pos
+        robot_scale = self.robot.action_scale
         moved_pose = [robot_pose[k] for k in self._moved]
         default = cfg.default or moved_pose
         pose = dict(enumerate(robot_pose)) | dict(zip(self._moved, default, strict=True))
         columns: list[tuple[Any, ...]] = []  # zero, lower and upper limit, and scale
         for term, indices in zip(cfg.observation, self._columns, strict=True):
-            zeros = [pose[k] if term.term == "joint_pos" else term.offset or 0.0 for k in indices]
+            subtracted = term.offset or 0.0 if term.term == "scan" else 0.0
+            zeros = [pose[k] if term.term == "joint_pos" else subtracted for k in indices]
             sizes = np.broadcast_to(math.inf if term.limit is None else term.limit, len(indices))
             low, high = np.clip([-sizes, sizes], *_limits(term.clip))
             columns += zip(zeros, low, high, np.broadcast_to(term.scale, len(indices)), strict=True)
         self._index = [torch.tensor(indices, device=device) for indices in self._columns]
-        self._sensors = [constant(term.at or (0.0, 0.0, 0.0)) for term in cfg.observation]
+        self._constants = [constant(self._find_constants(term)) for term in cfg.observation]
         self._zeros, self._low, self._high, self._scale = constant(columns).T
         self._clip = constant(np.broadcast_to(_limits(cfg.action_clip), (self.num_actions, 2))).T
         self._joints = torch.tensor(self._moved, device=device)
         self._pose = constant(moved_pose)
         self._offset = constant(cfg.action_offset or default)
         self._radians = constant(np.broadcast_to(cfg.action_scale, self.num_actions))
+        held = dict(zip(self.robot.joint_names, robot_pose, strict=True)) | (cfg.hold or {})
+        self._held = constant(np.subtract([*held.values()], robot_pose) / robot_scale)
+        self._wanderers = torch.tensor(self._wandering, dtype=torch.long, device=device)
+        amplitude = 0.0 if cfg.wander is None else cfg.wander.amplitude
+        self._amplitude = constant(np.broadcast_to(amplitude, len(self._wandering)) / robot_scale)
+        self._phases = constant(0.618 * np.arange(len(self._wandering)))  # so that joints do not swing together
+        self._mixed = constant(100.0 * np.arange(1, 1 + self.robot.num_joints))
 
     def _refuse(self, problem: str) -> None:
         raise ValueError(f"{self._path}: {problem}")
@@ -253,22 +356,30 @@ class Described(torch.nn.Module):
         if any(lower > upper for lower, upper in np.reshape(_limits(clip), (-1, 2))):
             self._refuse(f"{name} must be above 0, or have its lower limit first, got {clip}")
 
-    def _find_joints(self, names: tuple[str, ...] | None) -> tuple[int, ...]:
+    def _find_joints(self, names: tuple[str, ...] | None, setting: str = "joints") -> tuple[int, ...]:
         """Indices of joints of the robot, of all by default."""
         joints = self.robot.joint_names
         names = joints if names is None else names
         unknown = [name for name in names if name not in joints]
         if unknown or len(set(names)) < len(names):
             got = f"no {', '.join(unknown)}" if unknown else "each of them once"
-            self._refuse(f"joints must be the robot's, which has {got}, only {', '.join(joints)}")
+            self._refuse(f"{setting} must be the robot's, which has {got}, only {', '.join(joints)}")
         return tuple(joints.index(name) for name in names)
 
     def _find_columns(self, term: Term) -> Sequence[int]:
         """The columns of its quantity that a term takes."""
-        if term.term.startswith("joint"):
+        if "joints" in TERMS[term.term]:
             return self._moved if term.joints is None else self._find_joints(term.joints)
+        if term.term in ("rpy", "heading"):
+            return [_AXES.index(axis) for axis in (term.axes or "yaw").split()]
+        if term.term == "quat":
+            return ["wxyz".index(name) for name in (term.order or "").split()]
+        if term.term in ("constant", "contacts"):
+            return range(len(self._find_constants(term)))
+        if term.term == "clock":
+            return range(len(self._find_constants(term)) * len((term.order or _CLOCK).split()))
         if term.term != "scan":
-            return range({"last_action": self.num_actions, "clock": 2}.get(term.term, 3))
+            return range(self.num_actions if term.term == "last_action" else 3)
         xs, ys = term.x or self.robot.scan_x, term.y or self.robot.scan_y
         points = [(x, y) for y in ys for x in xs] if term.order == "x fastest" else [(x, y) for x in xs for y in ys]
         scan_points = zip(*self.robot.scan_points(), strict=True)
@@ -282,6 +393,20 @@ class Described(torch.nn.Module):
             self._refuse(f"the scan's points are not those of the robot: {remedy}")
         return [index_by_point[point] for point in points]
 
+    def _find_constants(self, term: Term) -> Any:
+        """Numbers that a term's quantity is computed from."""
+        if term.term == "clock":
+            return 2.0 * math.pi * np.atleast_1d(term.offset or 0.0)
+        if term.term == "constant":
+            return np.atleast_1d(term.value)
+        if term.term != "contacts":
+            return term.at or (0.0, 0.0, 0.0)
+        geoms = self.robot.foot_geoms
+        feet = term.feet or tuple((name,) for name in geoms)
+        if unknown := sorted({name for foot in feet for name in foot} - {*geoms}):
+            self._refuse(f"feet must be geoms of the robot's foot_geoms, {', '.join(geoms)}, got {', '.join(unknown)}")
+        return [[name in foot for name in geoms] for foot in feet]
+
     @property
     def graph_safe(self) -> bool:
         """Whether it may be captured as a CUDA graph, its ``reset`` too."""
@@ -290,7 +415,7 @@ class Described(torch.nn.Module):
     def _get_memory(self, count: int) -> _Memory:
         if count not in self._memories:
             sent = (self.cfg.action_delay_steps, self.num_actions)
-            shapes = (1,), (self.num_actions,), sent, (max(self.lengths), sum(self.widths))
+            shapes = (1,), (self.num_actions,), sent, (1,), (max(self.lengths), sum(self.widths))
             self._memories[count] = _Memory(*(torch.zeros((count, *shape), device=self._device) for shape in shapes))
         return self._memories[count]
 
@@ -313,13 +438,25 @@ class Described(torch.nn.Module):
         clip = self.cfg.observation_clip
         memory = self._get_memory(len(row))
         sensed = read_row(row, self.robot)
+        if self._wandering:
+            mixed = torch.frac((sensed.joint_pos * self._mixed).sum(dim=1, keepdim=True))
+            memory.phase.copy_(torch.where(memory.steps == 0.0, mixed, memory.phase))
         columns: list[torch.Tensor] = []
-        for term, at, index in zip(self.cfg.observation, self._sensors, self._index, strict=True):
+        for term, constants, index in zip(self.cfg.observation, self._constants, self._index, strict=True):
             if term.term == "lin_vel":
-                quantity = sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, at.expand_as(sensed.ang_vel))
+                quantity = sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, constants.expand_as(sensed.ang_vel))
             elif term.term == "clock":
-                angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
-                quantity = torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)
+                angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf)) + constants
+                waves = {"sin": torch.sin, "cos": torch.cos}
+                quantity = torch.cat([waves[name](angle) for name in (term.order or _CLOCK).split()], dim=1)
+            elif term.term == "constant":
+                quantity = constants.expand(len(row), -1)
+            elif term.term == "contacts":
+                quantity = (sensed.contacts[:, None] * constants).sum(dim=2)
+                if term.threshold is not None:
+                    quantity = (quantity > term.threshold).float()
+            elif term.term in ("rpy", "heading"):
+                quantity = _euler_angles(sensed)
             else:
                 quantity = memory.action if term.term == "last_action" else getattr(sensed, term.term).flatten(1)
             columns.append(quantity[:, index])
@@ -341,12 +478,14 @@ class Described(torch.nn.Module):
         """The robot's actions from outputs of the network, shape (num_envs, num_actions)."""
         memory = self._get_memory(len(output))
         memory.action.copy_(output.clamp(*self._clip))
+        actions = self._held.repeat(len(output), 1)
+        if self.cfg.wander is not None:
+            periods = memory.steps * (self.robot.control_dt / self.cfg.wander.period_s) + memory.phase + self._phases
+            actions[:, self._wanderers] += self._amplitude * torch.sin(2.0 * math.pi * periods)
         memory.steps.add_(1.0)
         queue = torch.cat([memory.action[:, None], memory.sent], dim=1)
         memory.sent.copy_(queue[:, :-1])
-        moved = (self._offset + self._radians * queue[:, -1] - self._pose) / self.robot.action_scale
-        actions = moved.new_zeros(len(moved), self.robot.num_joints)  # 0 holds the default pose
-        actions[:, self._joints] = moved
+        actions[:, self._joints] = (self._offset + self._radians * queue[:, -1] - self._pose) / self.robot.action_scale
         return actions
 
 

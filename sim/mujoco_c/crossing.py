@@ -28,6 +28,7 @@ from sim.mujoco_c.model import (
     crossing_model,
     goal_commands,
     observations,
+    sense_columns,
     step_penalties,
     to_mujoco,
 )
@@ -94,6 +95,7 @@ class EpisodeStates:
         self.qpos = starts.qpos.copy()
         self.qvel = starts.qvel.copy()
         self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
+        self.torques = np.zeros((len(self.data), robot.num_joints))
         self.warned = np.zeros(len(self.data), bool)
         self._joints = model.actuator_trnid[:, 0] - 1
         self._effort = model.actuator_forcerange[:, 1] / self.strength
@@ -119,6 +121,7 @@ class EpisodeStates:
             self.qpos[k] = data.qpos
             self.qvel[k] = data.qvel
             self.forces[k] = data.sensordata.reshape(-1, 3)
+            self.torques[k] = data.qfrc_actuator[6:]
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
 
     def disturb(self, rows: Array, running: NDArray[np.intp], step: int) -> Array:
@@ -189,9 +192,11 @@ def cross_in_mujoco_c(
             qvel = episodes.qvel[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, robot.speed)
-            rows[running] = observations(
+            row = observations(
                 heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
             )
+            senses = sense_columns(robot.senses, qpos, episodes.forces[running][:, feet], episodes.torques[running])
+            rows[running] = np.concatenate([row, senses], axis=1)
             rows = episodes.disturb(rows, running, step)
             observed = rows if remembers else rows[running]
             action = policy(torch.as_tensor(observed, dtype=torch.float32)).numpy().astype(np.float64)

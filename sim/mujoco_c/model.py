@@ -6,6 +6,7 @@ quaternion is wxyz, the base's linear velocity that of its origin in the world f
 frame.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any
@@ -271,6 +272,16 @@ def observations(
         ],
         axis=1,
     )
+
+
+def sense_columns(senses: Sequence[str], qpos: Array, forces: Array, torques: Array) -> Array:
+    """Columns after the scan, shape (num, sum of ``robot.sense_sizes``).
+
+    States have shape (num, 7 + num_joints), forces on the feet, world frame [N], (num, num_feet, 3), torques of the
+    joints [N m] (num, num_joints).
+    """
+    columns = {"pose": qpos[:, :7], "contacts": 0.01 * np.linalg.norm(forces, axis=2), "torques": 0.01 * torques}
+    return np.concatenate([qpos[:, :0], *(columns[name] for name in columns if name in senses)], axis=1)
 
 
 def step_penalties(

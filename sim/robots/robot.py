@@ -2,10 +2,10 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -19,6 +19,8 @@ ROBOTS_DIR = Path(__file__).parent
 """Folder of the files of the shipped robots."""
 PENALTY_DEFINITION = "squared"
 """How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
+SENSES = {"pose": ("heading", "yaw", "quat", "base_pos"), "contacts": ("contacts",), "torques": ("torques",)}
+"""What a robot may sense beside the usual row, and terms of a controller's observation that need it."""
 _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning", "label", "paper")
 _SHOWN_DIGITS = 12  # of a hash in a message
 
@@ -59,6 +61,8 @@ class RobotCfg:
     """Raw penalties that count, a subset of :data:`kernels.penalties.PENALTIES`."""
     collision_bit: bool
     """Whether base collision is a descriptor of its own (the paper: Cassie)."""
+    senses: tuple[Literal["pose", "contacts", "torques"], ...] = ()
+    """What stands after the scan in the observation row: :data:`kernels.observation` says it."""
     action_scale: PositiveFloat = 0.5
     """Radians per unit of action."""
     physics_dt: Annotated[float, Meta(gt=0, le=0.05)] = 0.005
@@ -126,11 +130,18 @@ class RobotCfg:
         return len(self.scan_x) * len(self.scan_y)
 
     @property
+    def sense_sizes(self) -> tuple[int, int, int]:
+        """Columns of the base's pose, of the contacts of the feet and of torques, in the observation row's order."""
+        sizes = {"pose": 7, "contacts": len(self.foot_geoms), "torques": self.num_joints}
+        pose, contacts, torques = (size * (name in self.senses) for name, size in sizes.items())
+        return pose, contacts, torques
+
+    @property
     def observation_size(self) -> int:
         """Columns of the observation row."""
         from kernels.observation import NUM_BASE_COLUMNS  # with Warp, which the help of commands does not need
 
-        return NUM_BASE_COLUMNS + 3 * self.num_joints + self.num_scan_points
+        return NUM_BASE_COLUMNS + 3 * self.num_joints + self.num_scan_points + sum(self.sense_sizes)
 
     @property
     def control_dt(self) -> float:
@@ -178,6 +189,12 @@ class RobotCfg:
     def train_command(self) -> str:
         """The command that trains the controller that comes with the robot."""
         return command_line("train", robot=self.spec, export=self.policy_file)
+
+
+def needed_senses(terms: Iterable[str]) -> list[str]:
+    """What a robot must sense for these terms of an observation, where ``rpy`` is called by its axes."""
+    names = {name for term in terms for name in term.split()}
+    return [sense for sense, quantities in SENSES.items() if names & {*quantities}]
 
 
 def robot_digest(robot: RobotCfg) -> str:

@@ -20,10 +20,10 @@ from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names
 from sim.robots.model import make_builder
 from sim.robots.model_files import find_model, read_model_files
 from sim.robots.probes import make_probes, measure_extents, start_height
-from sim.robots.robot import ROBOTS, RobotCfg
+from sim.robots.robot import ROBOTS, RobotCfg, needed_senses
 
 _ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
-_NAMES = (*_ROLES, "joint_names", "penalties")
+_NAMES = (*_ROLES, "joint_names", "penalties", "senses")
 _NOT_IN_TOML = ("label", "paper", "settings_file")
 NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
 """What a robot may be called, since files and folders are called after it."""
@@ -105,8 +105,8 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
     point in the default pose; limbs are all others. The default pose is the keyframe ``home`` of the file, else zero or
     the nearest angle that a joint can take. The contact force limit is the weight. The name is that of the folder of
-    ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it. ``given`` has
-    one value a joint where a setting is of joints.
+    ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it, and its
+    terms decide the senses. ``given`` has one value a joint where a setting is of joints.
     """
     model = robot_file.model
     nearest = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, *model.jnt_range[1:].T), 0.0).tolist()
@@ -130,8 +130,9 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     reach = np.abs(data.geom_xpos[feet, :2]) + model.geom_rbound[feet, None]  # of the feet from the base
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
     controller = file.with_name("controller.toml")
-    terms = read_toml(controller).get("observation", ()) if controller.exists() else ()
-    scan = next((term for term in terms if isinstance(term, dict) and term.get("term") == "scan"), {})
+    content = read_toml(controller).get("observation", ()) if controller.exists() else ()
+    terms = [term for term in content if isinstance(term, dict)]
+    scan = next((term for term in terms if term.get("term") == "scan"), {})
     inferred = {
         "name": file.parent.name,
         "joint_names": list(joint_names(model)),
@@ -142,6 +143,7 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
         "footprint": [float(np.ceil(100.0 * side) / 100.0) for side in reach.max(axis=0, initial=0.01)],
         "scan_x": scan.get("x", []),
         "scan_y": scan.get("y", []),
+        "senses": needed_senses([str(term.get("axes", term.get("term"))) for term in terms]),
     }
     return inferred | roles | given
 
@@ -152,7 +154,8 @@ def describe_inferred(robot: RobotCfg) -> str:
     if file is None or file.suffix != ".toml":
         return ""
     required = [field.name for field in fields(RobotCfg) if field.default is field.default_factory is MISSING]
-    names = [name for name in (*required, "default_base_height") if name not in read_toml(file)]
+    optional = ["default_base_height", *["senses"] * bool(robot.senses)]
+    names = [name for name in (*required, *optional) if name not in read_toml(file)]
     lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in names]
     return "\n  ".join([f"Inferred; what is not right can be set in {file}:", *lines])
 
@@ -163,7 +166,7 @@ def settings_problems(robot: RobotCfg) -> Iterator[str]:
         yield f"name must be {NEW_NAME}, got {robot.name!r}"
     for field in _NAMES:
         names = getattr(robot, field)
-        if not names and field not in ("limb_geoms", "penalties"):
+        if not names and field not in ("limb_geoms", "penalties", "senses"):
             yield f"{field} must name at least one"
         if len({*names}) < len(names):
             yield f"{field} must hold each name once, got {', '.join(names)}"

@@ -57,7 +57,6 @@ class Robots:
         for name, rows in arrays.items():
             shape = (self.num_envs, 5, 3) if name == "geom_force" else (self.num_envs, np.shape(rows)[-1])
             owner = self.rewards if name.startswith("previous") else self.motion.step
-            owner = self.motion if name == "joint_torque" else owner
             values = wp.array(np.broadcast_to(np.float32(rows), shape), dtype=float if len(shape) == 2 else wp.vec3)
             setattr(owner, name, values)
 

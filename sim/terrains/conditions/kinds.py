@@ -324,16 +324,17 @@ def _disturb_noise(step: DisturbedStep, row: wp.array[float], first: int, env: i
         # Drawn by the episode's own stream: neither robot nor slot changes an episode.
         number = step.memory.age[env, column] * step.observation.shape[1] + column
         state = wp.rand_init(int(step.episodes.rng[env]), number)
-        width = noise_width(step.memory.noise, column, step.num_joints)
+        width = noise_width(step.memory.noise, step.sensors, column)
         step.observation[env, column] += row[first] * width * wp.randf(state, -1.0, 1.0)
 
 
 def noise_widths(robot: Any) -> NDArray[np.float64]:
     """Half widths of legged_gym's noise of each column of an observation, shape (observation_size,)."""
     noise, joints = NoiseCfg(), robot.num_joints
-    counts = [3, 3, 3, 3, joints, joints, joints, len(robot.scan_points()[0])]
+    pose, feet, torques = robot.sense_sizes
+    counts = [3, 3, 3, 3, joints, joints, joints, robot.num_scan_points, min(pose, 3), max(pose - 3, 0), feet + torques]
     widths = [2.0 * noise.lin_vel, 0.25 * noise.ang_vel, noise.gravity, 0.0]
-    widths += [noise.joint_pos, 0.05 * noise.joint_vel, 0.0, 5.0 * noise.scan]
+    widths += [noise.joint_pos, 0.05 * noise.joint_vel, 0.0, 5.0 * noise.scan, 0.0, 0.5 * noise.gravity, 0.0]
     return np.repeat(widths, counts)
 
 

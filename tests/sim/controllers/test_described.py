@@ -1,6 +1,7 @@
 """Controllers as data: what the network of a description sees, what its actions mean, and what is refused."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,8 +34,8 @@ def describe(tmp_path):
 def seen_by(describe, anymal):
     """What a network sees of rows, step after step, that answers with ``output`` of each; robots begin at the first."""
 
-    def run(steps, terms, *lines, output=lambda seen, n: torch.zeros(len(seen), n)):
-        policy, seen = Described(read_controller(describe(terms, *lines)), anymal, "it"), []
+    def run(steps, terms, *lines, output=lambda seen, n: torch.zeros(len(seen), n), robot=anymal):
+        policy, seen = Described(read_controller(describe(terms, *lines)), robot, "it"), []
         policy.use(lambda rows: seen.append(rows) or output(rows, policy.num_actions), torch.device("cpu"))
         policy.reset(torch.ones(len(steps[0]), dtype=torch.bool))
         actions = [policy(step) for step in steps]
@@ -80,6 +81,65 @@ def test_terms_in_numbers(anymal, seen_by):
     ]  # fmt: skip
     np.testing.assert_allclose(seen[0, 0], expected, atol=1e-6)
     np.testing.assert_allclose(seen[1, 0, 9:11], [math.sin(math.pi / 2), math.cos(math.pi / 2)], atol=1e-6)  # 20 ms on
+
+
+@pytest.fixture
+def sensing(anymal):
+    """ANYmal with all senses, and rows of it that stand over the same pose at yaw 90, then -90 degrees."""
+    robot = replace(anymal, senses=("pose", "contacts", "torques"))
+    row = torch.zeros(2, robot.observation_size)
+    row[:, 6:9] = torch.tensor([0.6, 0.0, -0.8])  # gravity of a base pitched by asin(.6)
+    row[:, OBSERVATIONS : OBSERVATIONS + 3] = torch.tensor([2.0, 4.0, 0.6])
+    row[0, [OBSERVATIONS + 3, OBSERVATIONS + 6]] = torch.tensor([0.5**0.5, 0.5**0.5])
+    row[1, [OBSERVATIONS + 3, OBSERVATIONS + 6]] = torch.tensor([0.5**0.5, -(0.5**0.5)])
+    row[:, OBSERVATIONS + 7 : OBSERVATIONS + 11] = torch.tensor([1.0, 0.04, 0.06, 0.0])  # 100, 4, 6 and 0 N
+    row[:, OBSERVATIONS + 11 :] = 0.01 * torch.arange(12)
+    return robot, row
+
+
+@pytest.mark.parametrize(
+    ("term", "expected"),
+    [
+        ('"constant", value = [0.3, 2], scale = 2.0', [0.6, 4.0]),
+        ('"constant", value = 0.3', [0.3]),
+        ('"heading"', [math.pi / 2]),
+        ('"rpy", axes = "pitch roll"', [math.asin(0.6), 0.0]),
+        ('"rpy", axes = "yaw pitch"', [math.pi / 2, math.asin(0.6)]),
+        ('"quat", order = "w x y z"', [0.5**0.5, 0, 0, 0.5**0.5]),
+        ('"quat", order = "x y z w"', [0, 0, 0.5**0.5, 0.5**0.5]),
+        ('"base_pos"', [2.0, 4.0, 0.6]),
+        ('"contacts"', [100.0, 4.0, 6.0, 0.0]),
+        ('"contacts", threshold = 5', [1, 0, 1, 0]),
+        ('"contacts", threshold = 5, feet = [["RF_FOOT", "LH_FOOT"], ["RH_FOOT"]]', [1, 0]),  # 4 N and 6 N
+        ('"torques", joints = ["LF_KFE"]', [2.0]),
+        ('"clock", period_s = 0.08', [0, 1]),
+        ('"clock", period_s = 0.08, offset = [0, 0.25]', [0, 1, 1, 0]),
+        ('"clock", period_s = 0.08, offset = [0, 0.25], order = "cos sin"', [1, 0, 0, 1]),
+        ('"clock", period_s = 0.08, offset = [0.5, 0.25, 0], order = "sin"', [0, 1, 0]),
+    ],
+)
+def test_what_a_robot_senses_in_numbers(sensing, seen_by, term, expected):
+    seen, _ = seen_by([sensing[1]], f"{{term = {term}}}", robot=sensing[0])
+    np.testing.assert_allclose(seen[0, 0], expected, atol=1e-5)
+    if "heading" in term:
+        np.testing.assert_allclose(seen[0, 1], [-math.pi / 2], atol=1e-6)
+
+
+def test_joints_beside_those_that_move_hold_or_wander(anymal, seen_by):
+    rows = [torch.zeros(2, OBSERVATIONS) for _ in range(41)]
+    rows[0][1, 12] = 0.0025  # 100 x .0025 periods later
+    lines = ('joints = ["RF_HAA"]', "hold = {LF_KFE = -1.0, RH_KFE = 1.5}",
+             'wander = {joints = ["RH_KFE", "LH_HAA"], amplitude = [0.1, 0.2], period_s = 0.8}')  # fmt: skip
+    _, actions = seen_by(rows, '{term = "gravity"}', *lines)
+    targets = (actions * anymal.action_scale).numpy() + anymal.default_joint_pos
+    expected = np.tile(anymal.default_joint_pos, (41, 1))
+    expected[:, 2] = -1.0
+    pose = 100.0 * np.arange(1, 13) @ anymal.default_joint_pos
+    periods = pose + np.arange(41) / 40
+    expected[:, 11] = 1.5 + 0.1 * np.sin(2 * math.pi * periods)
+    expected[:, 6] += 0.2 * np.sin(2 * math.pi * (periods + 0.618))
+    np.testing.assert_allclose(targets[:, 0], expected, atol=1e-3)
+    np.testing.assert_allclose(targets[:31, 1], targets[10:, 0], atol=1e-3)
 
 
 def test_actions_in_numbers(anymal, seen_by):
@@ -200,6 +260,15 @@ def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, reme
         ('{term = "gravity"}', 'model_file = "dog.xml"', "robot"),
         ('{term = "gravity"}', 'history = {length = 2, newest = "new"}', r"history\.newest"),
         ('{term = "gravity"}', 'joints = ["LF_HAA", "LF_TOE"]', "joints.*LF_TOE"),
+        ('{term = "clock", period_s = 1, order = "tan"}', "", r"observation\[0\] \(clock\).*order.* 'tan'"),
+        ('{term = "scan", order = "x fastest", offset = [1, 2]}', "", r"\(scan\).*offset"),
+        ('{term = "heading"}, {term = "contacts"}', "", r"senses = \[.*contacts.*pose"),
+        ('{term = "rpy", axes = "roll yaw"}', "", r"senses = \[.pose"),
+        ('{term = "rpy", axes = "up"}', "", r"\(rpy\).*axes"),
+        ('{term = "quat"}', "", r"\(quat\).*order"),
+        ('{term = "gravity"}', "hold = {LF_HAA = 1.0}", "hold .*LF_HAA"),
+        ('{term = "gravity"}', "hold = {LF_TOE = 1.0}", "hold .*LF_TOE"),
+        ('{term = "gravity"}', 'wander = {joints = ["TOE"], amplitude = 1, period_s = 1}', r"wander\.joints .*TOE"),
         ('{term = "gravity"}', "action_scale = [1, 2]", "action_scale .*12.* 2"),
         ('{term = "gravity"}', "action_scale = nan", "action_scale"),
         ('{term = "gravity"}', "history = {length = 2}", "newest|by|fill"),

@@ -9,6 +9,7 @@ import warp as wp
 
 from kernels.episode import Invalidity, Outcome
 from kernels.penalties import penalty_columns
+from sim.controllers.described import read_row
 from sim.controllers.loaders import load_policy
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
 from sim.mujoco_c.crossing import EpisodeStates, MujocoC, cross_in_mujoco_c, draw_starts
@@ -106,6 +107,28 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     if changes is DRIVES:
         ideal, _ = cross_and_keep(shipped, policy, FLAT, starts, seconds)
         assert np.abs(ideal.qpos[:, 7:] - plain.qpos[:, 7:]).max() > 0.2
+
+
+def test_a_robot_senses_the_same_in_both(anymal):
+    """The pose, contacts and torques of ANYmal, which walks for 0.2 s: rows of the same numbers, after the scan."""
+    robot = dataclasses.replace(anymal, senses=("torques", "pose", "contacts"), max_duration_s=0.2)
+    walk, rows = load_policy(anymal.policy_file, anymal, "cpu"), []
+    keep = lambda row: rows.append(row.clone()) or walk(row[:, : anymal.observation_size])  # noqa: E731
+    rollout = Rollout(robot, keep, num_terrains=1, replicas=EPISODES, device="cpu")
+    for _ in range(2):  # robots that begin anew feel nothing of the episode before
+        rows.clear()
+        rollout.evaluate(Terrains(heights=FLAT[None], seeds=np.array([1000], np.uint32)))
+    ours, starts = [read_row(row, robot) for row in rows[:10]], draw_starts(robot, FLAT, 1000, EPISODES, "cpu")
+    rows.clear()
+    cross_in_mujoco_c(robot, keep, FLAT, starts)
+    plain = [read_row(row, robot) for row in rows[:10]]
+    np.testing.assert_allclose(plain[0].quat, starts.qpos[:, 3:7], atol=1e-6)
+    for ours_now, plain_now in zip(ours, plain, strict=True):
+        for name, tolerance in (("base_pos", 1e-5), ("quat", 1e-5), ("contacts", 0.1), ("torques", 0.01)):
+            np.testing.assert_allclose(getattr(ours_now, name), getattr(plain_now, name), atol=tolerance)
+    assert not plain[0].contacts.any() and not plain[0].torques.any()
+    assert 300.0 < float(plain[9].contacts.sum(dim=1).mean()) < 800.0  # 52 kg weigh 511 N
+    assert plain[9].torques.shape == (EPISODES, 12) and float(plain[9].torques.abs().max()) > 20.0
 
 
 SPEEDS = [0.0, 5.0, 10.0, 13.0, 25.0, -5.0]  # [rad/s]

@@ -20,7 +20,7 @@ from sim.robots.model import build_robot
 from sim.robots.model_files import read_model_files
 from sim.robots.robot import robot_digest
 from sim.robots.skeleton import Skeleton
-from sim.robots.user import PackedRobot, pack_robot
+from sim.robots.user import PackedRobot, describe_inferred, pack_robot
 from sim.terrains.terrains import Terrains
 from tests.sim import dogs
 from tests.sim.dogs import DRIVE, GAINS, KINDS, TRUNK, mjcf, stl, with_mesh, write_dog, write_toml
@@ -67,10 +67,13 @@ def test_values_of_a_robot_toml_may_be_of_all_joints_or_by_their_names(tmp_path)
     text = 'stiffness = 50\ndamping = {".*_hip" = 2, ".*_knee" = 3, HR_knee = 4}\nspeed = 0.5\n'
     text += 'saturation_effort = 40\nvelocity_limit = {".*_hip" = 20, ".*_knee" = 15}\n'
     file = write_toml(tmp_path / "dog", f"{text}default_joint_pos = {{'.*hip' = 0.6, '.*knee' = -1.2}}")
-    (file.parent / "controller.toml").write_text('observation = [{term = "scan", x = [0.0, 0.2], y = [0]}]')
+    (file.parent / "controller.toml").write_text(
+        'observation = [{term = "contacts"}, {term = "scan", x = [0.0, 0.2], y = [0]}, {term = "rpy", axes = "yaw"}]'
+    )
     dog = get_robot(str(file))
     assert (dog.stiffness, dog.damping, dog.default_joint_pos) == ((50,) * 8, (2, 3) * 3 + (2, 4), (0.6, -1.2) * 4)
     assert (dog.saturation_effort, dog.velocity_limit) == ((40,) * 8, (20, 15) * 4)
+    assert dog.senses == ("pose", "contacts") and "senses = [" in describe_inferred(dog)
     assert (dog.speed, dog.scan_x, dog.scan_y, dog.policy_file.name) == (0.5, (0.0, 0.2), (0.0,), "controller.toml")
 
 
