@@ -4,7 +4,6 @@ The scale of a penalty is its mean over those episodes on hard-random terrains t
 failure costs about 1 of each kind. Scales are measured once, before any search, and never tuned on an archive.
 """
 
-import re
 from bisect import bisect_left
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,12 +12,18 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.dose import measure_dose, parse_doses
+from qd.evaluate.level import (
+    MIN_GOAL_RATE,
+    describe_level_ground,
+    give_time,
+    is_measured,
+    measure_level_ground,
+    refuse_unless_walks,
+)
 from qd.search.directory import RUNS
-from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import Crosser
 from qd.workers.invalid import refuse_all_invalid
-from qd.workers.pipeline import Engine
 from sim.controllers.spec import controller_identity, crosser_name
 from sim.crossing import CrossingCfg
 from sim.files.atomic import prepare_output, to_json, write_atomically
@@ -26,15 +31,13 @@ from sim.files.templates import open_templates
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.robots.stand import Standing, describe_model, stand
-from sim.robots.user import describe_inferred
+from sim.robots.user import describe_inferred, write_setting
 from sim.rollout import RolloutResult
-from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import at_height
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
-_WALKS = 8  # episodes on flat ground in each simulator
 _APART = 0.05  # share by which speeds may differ
 _MAX_CONTACTS = 1_000  # a robot that has more is refused
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
@@ -62,10 +65,11 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
         expected = f"{policy} or a controller.toml beside {robot.settings_file}" if robot.settings_file else policy
         print(f"Without a controller, expected at {expected} or named by --policy, this is all.")
         return not standing.mistakes
+    robot = give_time(robot, policy, compute)
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
-        walks = walk(crosser, policy)
+        walks = measure_level_ground(crosser, policy, mujoco_c=True)
         slow, fast = sorted(walk["speed"] for walk in walks.values())
-        reaches_goal = min(walk["goal"] for walk in walks.values()) >= FAILING_GOAL_RATE
+        reaches_goal = min(walk["goal"] for walk in walks.values()) >= MIN_GOAL_RATE
         agree = fast - slow <= _APART * fast
         content = {"robot": robot, "walks": walks, "reaches_goal": reaches_goal, "agree": agree, "tolerance": _APART}
         print(_TEMPLATES.get_template("walking.txt").render(content).rstrip(), flush=True)
@@ -82,22 +86,37 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
     return not standing.mistakes
 
 
-def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute) -> RobotCfg:
-    """A user's robot with room for its contacts and the scales of its penalties; a shipped robot has both.
+def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute, *, skip_level_ground: bool = False) -> RobotCfg:
+    """A user's robot with room for contacts, time for a crossing, and penalty scales; a shipped robot has all.
 
-    Scales that are missing or older than its settings or model are measured with the given controller, and written.
+    Scales that are missing or older than its settings or model are measured with the given controller, and written. A
+    controller that does not cross level ground is refused before, unless ``skip_level_ground``.
     """
     if robot.settings_file is None:
         return robot
+    policy = policy or str(robot.policy_file)
+    has_scales = True
     try:
         read_penalty_scales(robot)
     except ValueError:
-        policy = policy or str(robot.policy_file)
+        has_scales = False
         check_policy(policy, robot, compute.device)
+        robot = prepare_level_ground(robot, policy, compute)
+    if not skip_level_ground:
+        refuse_unless_walks(robot, policy, compute)
+    if not has_scales:
         print(f"There are no penalty scales of robot '{robot.name}' as it is: they are measured first.", flush=True)
-        robot = _stand_with_room(robot, compute.device, 1.0).robot
         terrains = 1_000 if compute.device.startswith("cuda") else 100
         calibrate(robot, policy, compute=compute, terrains=terrains, replicas=4)
+    return robot
+
+
+def prepare_level_ground(robot: RobotCfg, policy: str, compute: Compute) -> RobotCfg:
+    """A user's robot with room for contacts and time for a crossing, both measured and written if they are not yet."""
+    if is_measured(robot, policy):
+        return robot
+    robot = give_time(_stand_with_room(robot, compute.device, 1.0).robot, policy, compute)
+    print(f"On level ground {describe_level_ground(robot, policy, compute)}.", flush=True)
     return robot
 
 
@@ -116,30 +135,9 @@ def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:
     if file is None or file.suffix != ".toml":
         print(f"It has too little room for contacts: write nconmax = {larger.nconmax} into its settings.", flush=True)
     else:
-        text = re.sub(r"^nconmax\s*=.*\n?", "", file.read_text(), flags=re.MULTILINE)
-        write_atomically(file, f"nconmax = {larger.nconmax}\n{text}".encode())
+        write_setting(file, "nconmax", larger.nconmax)
         print(f"It had too little room for contacts: {file} now has nconmax = {larger.nconmax}.", flush=True)
     return replace(standing, robot=larger)
-
-
-def walk(crosser: Crosser, policy: str, seed: int = 0) -> dict[str, dict[str, float]]:
-    """How a controller walks over flat ground here, ``searched``, and in MuJoCo C, ``mujoco_c``, at the same steps.
-
-    Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` from the start to the end
-    [m/s], and ``height`` of the base at the end [m].
-    """
-    flat = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([seed]))
-    engines: dict[str, Engine] = {"searched": "search", "mujoco_c": "mujoco_c_search"}
-    walks = {}
-    for name, engine in engines.items():
-        result = crosser.cross(policy, flat, replicas=_WALKS, engine=engine, label="flat ground", invalid_ok=True)
-        valid = ~result.invalid
-        end = result.final_position[valid]
-        speed = np.linalg.norm(end[:, :2] - CrossingCfg.start, axis=1) / result.duration_s[valid]
-        numbers = {"goal": result.reached_goal[valid], "speed": speed, "height": end[:, 2]}
-        means = {key: float(values.mean()) if valid.any() else 0.0 for key, values in numbers.items()}
-        walks[name] = {"episodes": int(valid.sum()), **means}
-    return walks
 
 
 def _half_label(dose: dict[str, Any], element: str) -> str:

@@ -15,6 +15,7 @@ from sim.controllers.spec import parse_controllers
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt, select_settings
 from sim.robots.find import get_robot, resolve_robot
+from sim.robots.robot import RobotCfg
 
 _METHOD_HELP = (
     f"Where new terrains come from: {'; '.join(f'{name}, {method.text}' for name, method in METHODS.items())}. Several "
@@ -28,6 +29,14 @@ def _compute(flags: WorkerFlags) -> Any:
     from qd.workers.compute import Compute
 
     return Compute.resolve(flags.device, flags.workers, flags.num_envs)
+
+
+def _warn_unless_walks(robot: RobotCfg, policy: str, compute: Any) -> None:
+    """Says so if a user's robot does not cross level ground under a controller: its rates say nothing of terrains."""
+    from qd.evaluate.level import describe_failure
+
+    if failure := describe_failure(robot, policy, compute):
+        print(f"{policy} does not walk on level ground: {failure}.", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +66,8 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     """Terrain space: super_gaussian, the paper's eight bumps; course, man-made elements; or one of your own,
     file.py:CLASS; behind any of them +friction, +softness, and conditions: {conditions}. super_gaussian if left
     out."""
+    skip_level_ground: bool = False
+    """Search though the controller of a robot of yours does not cross level ground, where every terrain stops it."""
     height: float | None = None
     """Lowers the terrains: the largest height of a bump [m], at most 0.25, and everything else alike. If left out, 0.25
     for shipped robots; for yours the height of the penalty scales: about 80 % of hard-random terrains are crossed."""
@@ -115,7 +126,8 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
         if self.resume is None:
             policy = None
-            flags = {"size": self.preset, "height": self.height, "compute": compute}
+            flags: dict[str, Any] = {"size": self.preset, "height": self.height, "compute": compute}
+            flags["skip_level_ground"] = self.skip_level_ground
             cfg, robot = start_search(self.robot, self.policy, self.space, **flags)
         elif self.run_dir or self.height is not None:
             flag = "--run-dir" if self.run_dir else "--height"
@@ -175,13 +187,20 @@ class JudgeCommand(_RunFlags):
 
     stages: tuple[str, ...] = ("fresh", "resolved", "others")
     """Some of fresh, resolved, others, varied, in the order in which to do them."""
+    skip_level_ground: bool = False
+    """Judge though the controller of a robot of yours does not cross level ground."""
 
     def execute(self) -> None:
         """Judges the run."""
+        from qd.evaluate.level import refuse_unless_walks
         from qd.faults.judge import judge
+        from qd.faults.searches import find_search
         from qd.search.results import print_summary
 
         run, named = self.named()
+        if not self.skip_level_ground:
+            searched = find_search(run, robot=self.robot, policy=self.policy, space=self.space)
+            refuse_unless_walks(searched.robot, searched.policy, named["compute"])
         archive = judge(run, stages=self.stages, **named)
         print_summary(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 
@@ -220,7 +239,7 @@ class ImportCommand:
     """Describe a controller and its robot as robot.toml and controller.toml, from what came with its weights.
 
     It prints both files. What is not understood is refused by its name; what is a guess says so, with its reason; what
-    nobody says is left to be filled in.
+    nobody says is left to be filled in. If nothing is, the robot crosses level ground, and a slow one gets more time.
     """
 
     source: tyro.conf.Positional[Path]
@@ -236,7 +255,12 @@ class ImportCommand:
         """Writes the files."""
         from sim.controllers.imports import import_controller
 
-        import_controller(self.source, self.model, self.out)
+        if import_controller(self.source, self.model, self.out):
+            from qd.check import prepare_level_ground
+            from qd.workers.compute import Compute
+
+            robot = get_robot(str(self.out / "robot.toml"))
+            prepare_level_ground(robot, str(robot.policy_file), Compute.resolve())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,6 +325,7 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
             pack = read_pack(find_pack(self.pack))
             robot = resolve_robot(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
             policy = self.policy or str(robot.policy_file)
+            _warn_unless_walks(robot, policy, _compute(self))
             report = evaluate_pack(pack, robot, policy, compute=_compute(self), out=self.out, **size)
             return int(self.fail_under is not None and not passes(report, self.fail_under))
         if self.fail_under is not None:
@@ -308,6 +333,7 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         robot, compute = get_robot(self.robot), _compute(self)
         if not makes_tables:
             policy = self.policy or str(robot.policy_file)
+            _warn_unless_walks(robot, policy, compute)
             evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
             return 0
         if self.policy is not None:
@@ -315,7 +341,9 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
                 f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
             )
         controllers = parse_controllers(self.policies, robot)
-        robot = ensure_ready(robot, next(iter(controllers.values())), compute)
+        robot = ensure_ready(robot, next(iter(controllers.values())), compute, skip_level_ground=True)
+        for policy in controllers.values():
+            _warn_unless_walks(robot, policy, compute)
         cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
 

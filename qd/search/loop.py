@@ -38,17 +38,24 @@ from sim.terrains.terrains import Terrains
 
 
 def start_search(
-    robot: str | None, policy: str | None, space: str | None, *, size: str, height: float | None, compute: Compute
+    robot: str | None,
+    policy: str | None,
+    space: str | None,
+    *,
+    size: str,
+    height: float | None,
+    compute: Compute,
+    skip_level_ground: bool = False,
 ) -> tuple[SearchCfg, RobotCfg]:
     """Settings of a new search by the name of a preset, and its robot, which is checked and has penalty scales then.
 
     Robot, controller and space are as flags take them. ``height`` is the largest one of a bump [m]; None is that which
-    fits the robot.
+    fits the robot. A user's robot must cross level ground, unless ``skip_level_ground``.
     """
     terrain_space = load_space(space)
     if height is not None:
         terrain_space = at_height(terrain_space, height)
-    ready = ensure_ready(get_robot(robot), policy, compute)
+    ready = ensure_ready(get_robot(robot), policy, compute, skip_level_ground=skip_level_ground)
     terrain_space = space_at(terrain_space, height, ready)
     return preset(size, ready, policy, space=terrain_space.name, space_sha256=terrain_space.sha256), ready
 

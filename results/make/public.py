@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from qd.check import ensure_ready, walk
+from qd.check import ensure_ready
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
+from qd.evaluate.level import walk
 from qd.faults.judge import judge
 from qd.search.directory import RunDirectory
 from qd.search.loop import search

@@ -31,11 +31,12 @@ _SETTINGS_BY_FILE = {
 }
 
 
-def import_controller(path: Path, model: str | Path | None, out: Path) -> None:
+def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
     """Writes robot.toml and controller.toml, with the weights beside them, to the folder ``out``, and prints both.
 
     ``path`` is a source of one of :data:`FORMATS`; the robot is called after the folder. ``model`` is what
     :func:`sim.robots.model_files.find_model` finds; None if the source names its model.
+    Returns whether nothing is left to be filled in.
     """
     if existing := [str(out / name) for name in _SETTINGS_BY_FILE if (out / name).exists()]:
         files = " and ".join(existing)
@@ -71,6 +72,7 @@ def import_controller(path: Path, model: str | Path | None, out: Path) -> None:
     print(f"\nFill in {', '.join(gaps)}; then:" if gaps else "\nNext:")
     for name in ("check", "archive"):
         print(f"  {command_line(name, robot=out / 'robot.toml')}")
+    return not gaps
 
 
 def _read(source_format: Any, path: Path, source: Source) -> Path:

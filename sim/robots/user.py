@@ -15,6 +15,7 @@ import warp as wp
 from kernels.penalties import PENALTIES
 from sim.controllers.spec import run_file
 from sim.device import host_device
+from sim.files.atomic import write_atomically
 from sim.files.settings import check_settings, from_builtins, read_toml, to_toml
 from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, mj, read_robot_file
 from sim.robots.model import make_builder
@@ -158,6 +159,13 @@ def describe_inferred(robot: RobotCfg) -> str:
     names = [name for name in (*required, *optional) if name not in read_toml(file)]
     lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in names]
     return "\n  ".join([f"Inferred; what is not right can be set in {file}:", *lines])
+
+
+def write_setting(file: Path, name: str, value: Any, reason: str = "") -> None:
+    """Writes a setting to the top of a robot.toml, with the reason as a comment, in place of a line of its name."""
+    text = re.sub(rf"^{name}\s*=.*\n?", "", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    line = f"{name} = {to_toml(value)}" + (f"  # {reason}" if reason else "")
+    write_atomically(file, f"{line}\n{text}".encode())
 
 
 def settings_problems(robot: RobotCfg) -> Iterator[str]:

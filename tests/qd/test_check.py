@@ -43,14 +43,14 @@ def test_a_controller_is_tried_before_anything_is_simulated(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("policy", "goals", "text"), [(None, 8, "kerb of "), ("tests.sim.policies:stand", 0, "not walk")]
+    ("policy", "goals", "text"), [(None, 20, "kerb of "), ("tests.sim.policies:stand", 0, "not walk")]
 )
 def test_both_simulators_agree_whether_a_controller_walks(tmp_path, monkeypatch, capsys, policy, goals, text):
     monkeypatch.chdir(tmp_path)
     walks = check_robot(get_robot("anymal"), policy, compute=Compute.resolve("cpu", "1", None))
     output = capsys.readouterr().out
-    assert output.count(f"{goals} of 8 reach the goal") == 2 and text in output
-    assert walks == ("kerb" in output) == (goals == 8)
+    assert output.count(f"{goals} of 20 reach the goal") == 2 and text in output
+    assert walks == ("kerb" in output) == (goals == 20)
 
 
 def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monkeypatch, tmp_path, capsys):
@@ -60,6 +60,7 @@ def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monk
     (tmp_path / "trot.py").write_text(CONTROLLER)
     robot = ensure_ready(get_robot(str(file)), policy, compute_by(Robots()))
     assert robot == get_robot(str(file)) and robot.nconmax > 2
+    assert robot.max_duration_s == 21.5  # 12 m at 0.7 m/s are 17.14 s, times 1.25, rounded up
     assert len(read_penalty_scales(robot)) == len(robot.penalties)
     assert ensure_ready(robot, policy, compute_by(Robots(stop_after=0))) is robot
     file.write_text(f"speed = 0.5\n{file.read_text()}")
