@@ -126,8 +126,7 @@ def _order_joints(env: dict[str, Any], path: Path, source: Source) -> tuple[list
         raise ValueError(f"{source.file}: joint_ordering must be physx, mjwarp or a list of joints, got {ordering}")
     if ordering == "mjwarp":
         return list(source.joints), "that of the model, as Newton orders joints; IO_descriptors.yaml would say it"
-    paths = sorted(source.joint_paths(), key=lambda names: (len(names), names))  # a body's children by name
-    return [names[-1] for names in paths], "breadth first, as PhysX orders joints; IO_descriptors.yaml would say it"
+    return source.sort_breadth_first(), "breadth first, as PhysX orders joints; IO_descriptors.yaml would say it"
 
 
 def _read_action(env: dict[str, Any], path: Path, source: Source, limit: float | None) -> list[str]:

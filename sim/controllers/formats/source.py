@@ -95,12 +95,19 @@ class Source:
         if tuple(joints) != self.joints:
             self.set(joints=list(joints), reason=reason)
 
-    def set_history(self, terms: list[dict[str, Any]], lengths: Sequence[int]) -> None:
+    def set_history(self, terms: list[dict[str, Any]], lengths: Sequence[int], by: str = "term") -> None:
         """Stores former steps as Isaac Lab and mjlab lay them out; lengths that differ are written into the terms."""
         for term, length in zip(terms, lengths, strict=True):
             term |= {"history": length} if len(set(lengths)) > 1 else {}
         if max(lengths) > 1:
-            self.set(history={"length": max(lengths), "newest": "last", "by": "term", "fill": "first"})
+            self.set(history={"length": max(lengths), "newest": "last", "by": by, "fill": "first"})
+
+    def read_ranges(self, ranges: Mapping[str, Any]) -> list[float]:
+        """Largest size of each command, of its ranges; a robot that is slower than usual is given its speed."""
+        yaw = ranges["ang_vel_z"] if "ang_vel_z" in ranges else ranges["ang_vel_yaw"]
+        limits = [float(ranges["lin_vel_x"][1]), *(float(max(map(abs, pair))) for pair in (ranges["lin_vel_y"], yaw))]
+        self.set_speed(ranges)
+        return limits
 
     def set_speed(self, ranges: Mapping[str, Any]) -> None:
         """Stores the fastest forward command of a training [m/s], if it is slower than that of a crossing."""
@@ -117,6 +124,10 @@ class Source:
             return [*path_to(int(model.body_parentid[body])), names[body]] if body in names else []
 
         return [path_to(body) for body in names]
+
+    def sort_breadth_first(self) -> list[str]:
+        """Joints from the base outwards, a body's children by name, as PhysX orders them."""
+        return [names[-1] for names in sorted(self.joint_paths(), key=lambda names: (len(names), names))]
 
     def find_imu(self) -> list[float] | None:
         """Position of the base's only site that is called after an IMU [m], shape (3,)."""
