@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from sim.controllers.formats.source import Source, collapse, find_weights, make_term
+from sim.controllers.formats.source import Source, collapse, make_term
 from sim.files.settings import YAML_SUFFIXES, read_yaml
 
 _TERMS = {
@@ -50,15 +50,12 @@ class DeployYaml:
         moved = _read_action(content.pop("actions"), default, source)
         by_motors = "the order in which the motors of a limb follow each other; joints are numbered, not named"
         source.set(joints=moved, reason=by_motors)
-        limits = source.read_ranges(content.pop("commands")["base_velocity"]["ranges"])
-        _read_observations(content.pop("observations"), joints, moved, limits, source)
+        _read_observations(content.pop("observations"), joints, moved, content.pop("commands"), source)
         source.refuse_unknown(content, ())
-        folders = (file.parent, file.parent.parent / "exported")
-        files = [folder / f"policy.{suffix}" for folder in folders for suffix in ("onnx", "pt")]
-        weights = next(filter(Path.is_file, files), None)
-        if weights is None:
+        files = [folder / "policy.onnx" for folder in (file.parent.parent / "exported", file.parent)]
+        if not any(map(Path.is_file, files)):
             raise ValueError(f"it has no weights, expected {' or '.join(map(str, files))}")
-        return weights
+        return next(filter(Path.is_file, files))
 
 
 def _find_order(motors: list[int], source: Source) -> list[str]:
@@ -89,30 +86,31 @@ def _read_action(actions: dict[str, Any], default: dict[str, float], source: Sou
 
 
 def _select_joints(indices: Any, joints: list[str]) -> list[str]:
-    """The joints of a list of indices; all of them for a slice or None."""
-    return joints if indices in (None, "slice", [None] * 3) else [joints[k] for k in indices]
+    """The joints of a list of indices, or of the numbers of a slice, which has None in it; all of them for None."""
+    if indices is None or None in indices:
+        return joints[slice(*indices or [None])]
+    return [joints[k] for k in indices]
 
 
 def _read_observations(
-    groups: dict[str, Any], joints: list[str], moved: list[str], limit: list[float], source: Source
+    groups: dict[str, Any], joints: list[str], moved: list[str], commands: dict[str, Any], source: Source
 ) -> None:
-    """Terms in their order, of the one group that there may be."""
-    if not any("params" in item for item in groups.values()):
-        if len(groups) > 1:
-            raise ValueError(f"{source.file}: observations must be one group, got {', '.join(groups)}")
-        (groups,) = groups.values()
-    terms = dict(groups)
+    """Terms in their order; they may be in a table of their own, as the network's input is called."""
+    first = next(iter(groups.values()))
+    terms = dict(first if len(groups) == 1 and "params" not in first else groups)
     by_row = terms.pop("use_gym_history", False)
     scale_first = terms.pop("scale_first", False)
     source.refuse_unknown(terms, _TERMS)
     rows = []
     for name, item in terms.items():
-        params = item.get("params") or {}
+        if "params" not in item:
+            raise ValueError(f"{source.file}: observations must be those of one input, got {', '.join(terms)}")
         if scale_first and item.get("clip"):
             raise ValueError(f"{source.file}: scale_first is not supported, where {name} has a clip")
+        params = item["params"] or {}
         row = make_term(_TERMS[name], collapse(item.get("scale")), clip=item.get("clip"))
         if row["term"] == "command":
-            row["limit"] = limit
+            row["limit"] = source.read_ranges(commands[params["command_name"]]["ranges"])
         elif row["term"] == "clock":
             row["period_s"] = params["period"]
         elif row["term"].startswith("joint"):

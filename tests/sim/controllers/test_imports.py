@@ -88,6 +88,23 @@ observations:
     height_scan: {func: 'isaaclab.envs.mdp.observations:height_scan', clip: !!python/tuple [-1.0, 1.0],
                   params: {sensor_cfg: {name: height_scanner}, offset: 0.4}}
 """
+DEPLOY = """
+joint_ids_map: [2, 0, 6, 4, 3, 1, 7, 5]
+step_dt: 0.02
+stiffness: [20, 21, 22, 23, 24, 25, 26, 27]
+damping: [1, 1, 1, 1, 1, 1, 1, 1]
+default_joint_pos: [0.5, 0.6, 0.5, 0.6, -1.1, -1.2, -1.1, -1.2]
+commands: {it: {ranges: {lin_vel_x: [-0.5, 0.6], lin_vel_y: [-0.4, 0.3], ang_vel_z: [-0.2, 0.2]}}}
+actions:
+  JointPositionAction: {clip: null, joint_names: [.*], scale: [0.3, 0.3, 0.3, 0.3, 0.2, 0.2, 0.2, 0.2],
+    offset: [0.5, 0.6, 0.5, 0.6, -1.1, -1.2, -1.1, -1.2], joint_ids: !!python/object/apply:builtins.slice [null, null]}
+observations:
+  base_ang_vel: {params: {}, clip: [-9, 9], scale: [0.2, 0.2, 0.2], history_length: 3}
+  velocity_commands: {params: {command_name: it}, clip: null, scale: [1, 1, 1], history_length: 3}
+  joint_pos_rel: {params: {}, clip: null, scale: [1, 1, 1, 1, 1, 1, 1, 1], history_length: 3}
+  joint_vel_rel: {params: {asset_cfg: {joint_ids: [0, 4]}}, clip: null, scale: [1, 1], history_length: 3}
+  gait_phase: {params: {period: 0.6}, clip: null, scale: [1, 1], history_length: 3}
+"""
 
 
 def write(file, content):
@@ -133,6 +150,17 @@ def isaac_lab(folder, old="", new=""):
     write(folder / "params" / "env.yaml", ISAAC.replace(old, new))
     write(folder / "params" / "agent.yaml", {"clip_actions": 5.0, "policy": {"activation": "relu"}})
     write(folder / "exported" / "policy.pt", 3 + 3 + 8 + 8 + 6)
+    return folder
+
+
+def deploy(folder, *changes):
+    text = DEPLOY
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    write(folder / "params" / "deploy.yaml", text)
+    (folder / "exported").mkdir()
+    onnx.save(linear(3 * 18, 8, batch=1), folder / "exported" / "policy.onnx")
     return folder
 
 
@@ -215,6 +243,32 @@ def test_the_metadata_of_mjlab_are_read(tmp_path):
     first, second, *_ = controller.observation
     assert (first.at, first.clip, first.history, second.scale, second.history) == ((0.1, 0, 0), (-5, 5), 1, 0.2, 3)
     assert vars(controller.history) == {"length": 3, "newest": "last", "by": "term", "fill": "first"}
+
+
+def test_a_deploy_yaml_numbers_joints_by_their_motors(tmp_path):
+    robot, controller = imported(deploy(tmp_path / "v0"), tmp_path)
+    assert (controller.joints, controller.action_scale) == (HIPS_FIRST, (0.3,) * 4 + (0.2,) * 4)
+    # The first motors are those of the right legs, in the file are the left ones.
+    assert robot.stiffness == (22, 23, 20, 21, 26, 27, 24, 25)
+    assert (robot.default_joint_pos, robot.speed, robot.control_dt) == (IN_FILE, 0.6, 0.02)
+    ang_vel, command, joint_pos, joint_vel, clock = controller.observation
+    assert (ang_vel.clip, ang_vel.scale, command.limit) == ((-9, 9), 0.2, (0.6, 0.4, 0.2))
+    assert (joint_pos.joints, joint_vel.joints, clock.period_s) == (None, ("FL_hip", "FL_knee"), 0.6)
+    assert vars(controller.history) == {"length": 3, "newest": "last", "by": "term", "fill": "first"}
+
+
+def test_a_deploy_yaml_may_have_mjlabs_order_missing_motors_and_whole_rows(tmp_path):
+    changes = [
+        ("[2, 0, 6, 4, 3, 1, 7, 5]", "[2, 3, 0, 1, 12, 13, 10, 11]"),
+        ("!!python/object/apply:builtins.slice [null, null]", "null"),
+        ("[0.5, 0.6, 0.5, 0.6, -1.1, -1.2, -1.1, -1.2]", "[0.5, -1.1, 0.6, -1.2, 0.5, -1.1, 0.6, -1.2]"),
+        ("offset: [0.5", "offset: [0.4"),
+        ("observations:", "observations:\n  use_gym_history: true"),
+    ]
+    robot, controller = imported(deploy(tmp_path / "v0", *changes), tmp_path)
+    assert controller.joints == JOINTS and robot.stiffness == (22, 23, 20, 21, 26, 27, 24, 25)
+    assert controller.action_offset == (0.4, -1.1, 0.6, -1.2, 0.5, -1.1, 0.6, -1.2)
+    assert controller.history.by == "row"
 
 
 def test_a_run_of_isaac_lab_is_read(tmp_path):
@@ -308,6 +362,11 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (isaac_lab, {"old": "clip: null}", "new": "clip: {.*_toe: [-1, 1]}}"}, "clip"),
         (isaac_lab, {"old": "init_state:", "new": "joint_ordering: robot_schema\n    init_state:"}, "joint_ordering"),
         (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),
+        (lambda folder: deploy(folder, ("gait_phase", "height_scan")), {}, "height_scan"),
+        (lambda folder: deploy(folder, ("JointPositionAction", "JointVelocityAction")), {}, "JointVelocityAction"),
+        (lambda folder: deploy(folder, ("clip: null, joint", "clip: [[-1, 1]], joint")), {}, "actions.clip"),
+        (lambda folder: deploy(folder, (", 7, 5]", ", 7]")), {}, "joint_ids_map"),
+        (lambda folder: deploy(folder, ("step_dt:", "gear: 1\nstep_dt:")), {}, "gear"),
         (lambda folder: folder, {}, "a run of Isaac Lab (a folder with params/env.yaml), or a deployment of"),
     ],
 )
