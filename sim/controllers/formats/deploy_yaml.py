@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from sim.controllers.formats.source import Source, collapse, make_term
+from sim.controllers.formats.source import Source, collapse, find_checkpoint, make_term
 from sim.files.settings import YAML_SUFFIXES, read_yaml
 
 _TERMS = {
@@ -52,10 +52,7 @@ class DeployYaml:
         source.set(joints=moved, reason=by_motors)
         _read_observations(content.pop("observations"), joints, moved, content.pop("commands"), source)
         source.refuse_unknown(content, ())
-        files = [folder / "policy.onnx" for folder in (file.parent.parent / "exported", file.parent)]
-        if not any(map(Path.is_file, files)):
-            raise ValueError(f"it has no weights, expected {' or '.join(map(str, files))}")
-        return next(filter(Path.is_file, files))
+        return find_checkpoint(file.parent.parent, "exported/policy.onnx", f"{file.parent.name}/policy.onnx")
 
 
 def _find_order(motors: list[int], source: Source) -> list[str]:
