@@ -29,8 +29,8 @@ from sim.robots.robot import RobotCfg, needed_senses
 TERMS: dict[str, tuple[str, ...]] = {
     "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit",), "joint_pos": ("joints",),
     "joint_vel": ("joints",), "last_action": (), "clock": ("period_s", "order", "offset"),
-    "scan": ("order", "x", "y", "offset"), "constant": ("value",), "heading": (), "rpy": ("axes",), "quat": ("order",),
-    "base_pos": (), "contacts": ("threshold", "feet"), "torques": ("joints",),
+    "constant": ("value",), "rpy": ("axes",), "heading": (), "quat": ("order",), "base_pos": (),
+    "contacts": ("threshold", "feet"), "torques": ("joints",), "scan": ("order", "x", "y", "offset"),
 }  # fmt: skip
 """Fields of each term besides those of all terms; docs/controllers.md explains them."""
 _REQUIRED = {"clock": {"period_s"}, "scan": {"order"}, "constant": {"value"}, "rpy": {"axes"}, "quat": {"order"}}
