@@ -105,4 +105,7 @@ def resolved(robot: RobotCfg) -> tuple[RobotCfg, SolverCfg]:
     step = round(control_s / decimation, 12)
     delay = round(robot.drive_delay_steps * robot.physics_dt / step)
     finer = replace(robot, physics_dt=step, decimation=decimation, drive_delay_steps=delay)
+    if (net := robot.actuator_net) is not None:  # it goes on at its own rate
+        net = replace(net, decimation=round(net.decimation * robot.physics_dt / step))
+        finer = replace(finer, actuator_net=net)
     return finer, SolverCfg(time_constant_s=_RESOLVED_TIME_CONSTANT_S)

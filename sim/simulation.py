@@ -10,6 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from kernels.actuator_net import make_torques
 from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
@@ -23,10 +24,11 @@ from kernels.rewards import Motion, Rewards, make_rewards, make_weights, reward_
 from kernels.state import RobotStep
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import recording
+from sim.robots.actuator_net import ActuatorNet
 from sim.robots.compiled import robot_spec
 from sim.robots.model import make_builder
 from sim.robots.probes import make_probes
-from sim.robots.robot import RobotCfg
+from sim.robots.robot import ActuatorNetCfg, RobotCfg
 from sim.robots.training import NoiseCfg, TrainingCfg
 from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
@@ -217,6 +219,9 @@ class Simulation:
             effort = solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
             motors = np.array([robot.saturation_effort, robot.velocity_limit])[:, joints]
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
+        self._net = None
+        if robot.actuator_net is not None:
+            self._build_net(robot.actuator_net)
         max_steps = robot.drive_delay_steps
         if self.bank.conditions is not None:
             max_steps += math.ceil(MAX_LATENCY_S / robot.physics_dt)
@@ -226,6 +231,19 @@ class Simulation:
             self._delay = make_zeros(Delay, self.device, steps=num_envs, **shapes)
             self._delay.steps.fill_(robot.drive_delay_steps)
             self._delay.at_first = self.sensors.default_joint_pos
+
+    def _build_net(self, cfg: ActuatorNetCfg) -> None:
+        net = ActuatorNet(cfg, 0)
+        how = {name: getattr(net, name) for name in ("num_recurrent", "activation", "history")}
+        width = max(layer.shape[1] for layer in net.layers)
+        self._write_torques = make_torques(width, decimation=cfg.decimation, **how)
+        num_columns = 2 + 2 * net.history + 2 * sum(net.sizes[: net.num_recurrent])
+        self._net = (
+            wp.array(np.concatenate([layer.ravel() for layer in net.layers]), dtype=float),
+            wp.array(net.sizes, dtype=int),
+            wp.array(2 + np.array(net.inputs), dtype=int),
+            wp.zeros((*self.solver.mjw_data.ctrl.shape, num_columns), dtype=float),
+        )
 
     def _build_conditions(self) -> None:
         self.disturbed = None
@@ -310,6 +328,8 @@ class Simulation:
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
             to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
+            if self._net is not None:
+                self._write_torques(self.joint_q, self.joint_qd, *self._net, coordinates)
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self.dynamics.find()
@@ -329,6 +349,8 @@ class Simulation:
         clear_rows(mask, self.parked.reshape((-1, 1)).view(float))  # whose 0 has the same bits
         if self._delay.age is not None:
             clear_rows(mask, self._delay.age.view(float))
+        if self._net is not None:
+            clear_rows(mask, self._net[-1].reshape((self.num_envs, -1)))
         if isinstance(self.dynamics, StockDynamics):
             # It multiplies whole tiles of the constraint Jacobian, unused rows by zero: a world that was once not
             # finite would stay so, whatever state it is reset to.

@@ -32,6 +32,7 @@ from sim.mujoco_c.model import (
     step_penalties,
     to_mujoco,
 )
+from sim.robots.actuator_net import ActuatorNet
 from sim.robots.compiled import mj, robot_spec
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -101,16 +102,25 @@ class EpisodeStates:
         self._effort = model.actuator_forcerange[:, 1] / self.strength
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
         self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
+        self._steps = 0
+        self._net = robot.actuator_net and ActuatorNet(robot.actuator_net, len(self.data) * model.nu)
         self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
         self._delayed = deque([self._targets.copy()] * self.delay_steps)
 
     def step(self, running: NDArray[np.intp]) -> None:
         """One physics step of the numbered episodes."""
         self._delayed.append(self._targets.copy())
-        targets = self._delayed.popleft()[:, self._joints]
+        controls = self._delayed.popleft()[:, self._joints]
+        if self.robot.actuator_net is not None and self._net is not None:
+            if self._steps % self.robot.actuator_net.decimation == 0:
+                error = controls - self.qpos[:, 7 + self._joints]
+                torques = self._net.step(error.ravel(), self.qvel[:, 6 + self._joints].ravel())
+                self._torques = torques.reshape(controls.shape)
+            controls = self._torques
+        self._steps += 1
         for k in running:
             data = self.data[k]
-            data.ctrl[:] = targets[k]
+            data.ctrl[:] = controls[k]
             if self._motors is not None:
                 (stall, limit) = self._motors
                 effort = self._effort

@@ -1,7 +1,7 @@
 """A robot's file as MuJoCo compiles it, in the one form that simulations and pictures are made of, and its drives.
 
-Each joint has at most one position actuator, of the joint's name; geoms touch the ground and nothing else; options are
-MuJoCo's but gravity and ``impratio``.
+Each joint has at most one actuator, of the joint's name: of positions, or a motor for an actuator network. Geoms touch
+the ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
 """
 
 import itertools
@@ -167,7 +167,7 @@ def _actuator_kind(model: Any, k: int) -> str:
 
 
 def set_drives(spec: Any, drives: Drives, robot: RobotCfg) -> None:
-    """Gives each joint a position actuator, in the joints' order, by the settings' gains if they have some."""
+    """Gives each joint a position actuator, by the settings' gains if they have some, or a motor for a network."""
     for actuator in spec.actuators:
         spec.delete(actuator)
     stiffness = drives.stiffness if robot.stiffness is None else robot.stiffness
@@ -179,12 +179,15 @@ def set_drives(spec: Any, drives: Drives, robot: RobotCfg) -> None:
         if k in drives.followers:
             continue
         actuator = spec.add_actuator(name=name, target=name, trntype=_JOINT)
-        actuator.set_to_position(kp=stiffness[k], kv=damping[k])
+        if robot.actuator_net is None:
+            actuator.set_to_position(kp=stiffness[k], kv=damping[k])
+        else:
+            actuator.set_to_motor()
         actuator.gear = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
         actuator.dyntype = mj.mjtDyn.mjDYN_NONE
         actuator.forcelimited = np.isfinite(effort[k])
         actuator.forcerange = (-effort[k], effort[k]) if np.isfinite(effort[k]) else (0.0, 0.0)
-        actuator.ctrllimited = not np.isnan(drives.targets[k, 0])
+        actuator.ctrllimited = robot.actuator_net is None and not np.isnan(drives.targets[k, 0])
         actuator.ctrlrange = np.nan_to_num(drives.targets[k])
 
 
@@ -433,7 +436,11 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
         problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")
     gains = drives.stiffness if robot.stiffness is None else robot.stiffness
-    if not problems and (limp := [k for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers)]):
+    if (
+        robot.actuator_net is None
+        and not problems
+        and (limp := [k for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers)])
+    ):
         listed = ", ".join(names[k] for k in limp)
         problems.append(f"no gains for {listed}: give stiffness and damping, or <position> in {robot.model_file}")
     return [*problems, *no_geom]

@@ -38,10 +38,12 @@ def make_builder(model: Any) -> newton.ModelBuilder:
     builder.add_articulation(joints)
     for actuator in range(model.nu):
         dof = int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
-        builder.joint_target_ke[dof] = float(model.actuator_gainprm[actuator, 0])
-        builder.joint_target_kd[dof] = float(-model.actuator_biasprm[actuator, 2])
-        builder.joint_target_mode[dof] = int(newton.JointTargetMode.POSITION)
-        row: dict[str, Any] = {"ctrl_source": solver.CtrlSource.JOINT_TARGET, "ctrl_type": solver.CtrlType.POSITION}
+        row: dict[str, Any] = {"ctrl_source": solver.CtrlSource.CTRL_DIRECT, "ctrl_type": solver.CtrlType.GENERAL}
+        if model.actuator_biastype[actuator]:  # else a motor, whose force is its control
+            builder.joint_target_ke[dof] = float(model.actuator_gainprm[actuator, 0])
+            builder.joint_target_kd[dof] = float(-model.actuator_biasprm[actuator, 2])
+            builder.joint_target_mode[dof] = int(newton.JointTargetMode.POSITION)
+            row = {"ctrl_source": solver.CtrlSource.JOINT_TARGET, "ctrl_type": solver.CtrlType.POSITION}
         for name in ("ctrl", "force"):
             limited = bool(getattr(model, f"actuator_{name}limited")[actuator])
             row[f"actuator_{name}limited"] = row[f"actuator_has_{name}range"] = int(limited)

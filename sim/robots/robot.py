@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from sim.files.command import command_line
-from sim.files.settings import NonNegativeFloat, PositiveFloat, PositiveInt
+from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from sim.robots.model_files import read_model_files
 from sim.robots.training import LearningCfg, PaperCfg, RewardCfg, TrainingCfg, TuningCfg
 
@@ -23,6 +23,26 @@ SENSES = {"pose": ("heading", "yaw", "quat", "base_pos"), "contacts": ("contacts
 """What a robot may sense beside the usual row, and terms of a controller's observation that need it."""
 _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning", "label", "paper")
 _SHOWN_DIGITS = 12  # of a hash in a message
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActuatorNetCfg:
+    """A network that all drives of a robot have in place of PD gains, from position error and velocity to torque.
+
+    Settings have the names of Isaac Lab's ``ActuatorNetLSTM`` and ``ActuatorNetMLP``.
+    """
+
+    file: Path
+    """TorchScript; relative to the robot's settings."""
+    pos_scale: float = 1.0
+    """Factor of the target less the position [rad]."""
+    vel_scale: float = 1.0
+    torque_scale: float = 1.0
+    input_order: Literal["pos_vel", "vel_pos"] = "pos_vel"
+    input_idx: tuple[NonNegativeInt, ...] = ()
+    """Evaluations ago of which dense layers see error and velocity; if empty, the last ones, the newest first."""
+    decimation: PositiveInt = 1
+    """Physics steps from one evaluation to the next; meanwhile the torque is held."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +113,8 @@ class RobotCfg:
     """
     velocity_limit: tuple[PositiveFloat, ...] | None = None
     """Speed of each joint at which its motor has no torque left [rad/s]."""
+    actuator_net: ActuatorNetCfg | None = None
+    """Network in place of PD gains; its torque is clipped as theirs is."""
     drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
     """Physics steps by which joint targets are late. Until the first one arrives, the default pose is held."""
     friction: PositiveFloat | None = None
@@ -205,6 +227,9 @@ def robot_digest(robot: RobotCfg) -> str:
     defaults = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(robot)}
     counted = {name: value for name, value in vars(robot).items() if name not in _NOT_IN_DIGEST}
     settings = {name: value for name, value in counted.items() if value != defaults[name]}
+    if robot.actuator_net is not None:
+        net = robot.actuator_net.file
+        settings["actuator_net"] = asdict(robot.actuator_net) | {"file": hashlib.sha256(net.read_bytes()).hexdigest()}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for file in read_model_files(robot.model_file).files:
         digest.update(hashlib.sha256(file.read_bytes()).digest())

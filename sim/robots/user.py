@@ -17,6 +17,7 @@ from sim.controllers.spec import run_file
 from sim.device import host_device
 from sim.files.atomic import write_atomically
 from sim.files.settings import check_settings, from_builtins, read_toml, to_toml
+from sim.robots.actuator_net import ActuatorNet
 from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, mj, read_robot_file
 from sim.robots.model import make_builder
 from sim.robots.model_files import find_model, read_model_files
@@ -44,8 +45,12 @@ def load_robot(path: Path) -> RobotCfg:
         got = "nothing" if robot is None else type(robot).__name__
         raise ValueError(f"{path} must set ROBOT to a sim.robots.robot.RobotCfg, got {got} (docs/robots.md)")
     try:
-        robot = replace(robot, model_file=find_model(robot.model_file, file.parent), settings_file=file)
+        net = robot.actuator_net and replace(robot.actuator_net, file=file.parent / robot.actuator_net.file)
+        model = find_model(robot.model_file, file.parent)
+        robot = replace(robot, model_file=model, settings_file=file, actuator_net=net)
         check_settings(robot)
+        if net is not None:
+            ActuatorNet(net, 0)
         robot_file = read_robot_file(robot.model_file)
         builder = make_builder(robot_file.model)
         mistakes = [*settings_problems(robot), *file_problems(robot, robot_file)]
@@ -188,6 +193,8 @@ def settings_problems(robot: RobotCfg) -> Iterator[str]:
     for name, other in (("stiffness", "damping"), ("saturation_effort", "velocity_limit")):
         if (getattr(robot, name) is None) != (getattr(robot, other) is None):
             yield f"{name} and {other} must be given together"
+    if robot.actuator_net is not None and robot.stiffness is not None:
+        yield "actuator_net stands in place of stiffness and damping: leave those out"
     if robot.max_duration_s < robot.control_dt:
         yield f"max_duration_s must be a control step or more, {robot.control_dt:g} s"
     constant, least = robot.contact_time_constant_s, 2.0 * robot.physics_dt
@@ -201,21 +208,23 @@ class PackedRobot:
 
     robot: RobotCfg
     files: tuple[tuple[str, bytes], ...]
-    """Path and content of the model's files, itself first, below a folder they have in common."""
+    """Path and content of the model's files, itself first, and an actuator network, below a folder in common."""
 
     def unpacked(self, folder: Path) -> RobotCfg:
         """The robot with its files in ``folder``; they are needed until its model is built."""
         for name, content in self.files:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
-        return replace(self.robot, model_file=folder / self.files[0][0])
+        net = self.robot.actuator_net and replace(self.robot.actuator_net, file=folder / self.files[-1][0])
+        return replace(self.robot, model_file=folder / self.files[0][0], actuator_net=net)
 
 
 def pack_robot(robot: RobotCfg) -> PackedRobot | str:
     """What to send of a robot: the name alone of a shipped one, which every machine has."""
     if robot.settings_file is None and ROBOTS.get(robot.name) == robot:
         return robot.name
-    files = read_model_files(robot.model_file).files
+    nets = () if robot.actuator_net is None else (robot.actuator_net.file,)
+    files = (*read_model_files(robot.model_file).files, *nets)
     # The folder's own name goes along: a URDF may call its package by it.
     root = Path(os.path.commonpath([file.parent for file in files])).parent
     return PackedRobot(robot=robot, files=tuple((str(file.relative_to(root)), file.read_bytes()) for file in files))
