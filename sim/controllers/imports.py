@@ -23,7 +23,7 @@ from sim.robots.user import NEW_NAME, is_new_name
 
 FORMATS = (IsaacLab(), DeployYaml(), UnitreeRlGym(), RlSar(), LeggedGym(), Mjlab(), Weights())
 """Formats of sources: the first that matches a path reads it into a Source, and returns the file of the weights."""
-_ROBOT_SETTINGS = ("drive_delay_steps", "physics_dt", "decimation", "speed", "max_duration_s")
+_ROBOT_SETTINGS = ("actuator_net", "drive_delay_steps", "physics_dt", "decimation", "speed", "max_duration_s")
 _ACTION_SETTINGS = ("policy", "joints", "action_scale", "action_offset", "action_clip")
 _OBSERVATION_SETTINGS = ("observation_clip", "activation", "history", "observation")
 _SETTINGS_BY_FILE = {

@@ -9,7 +9,7 @@ import numpy as np
 
 from sim.controllers.formats.rsl_rl import read_activation
 from sim.controllers.formats.source import Source, collapse, find_checkpoint, make_term
-from sim.files.settings import read_yaml
+from sim.files.settings import read_yaml, to_toml
 from sim.robots.compiled import PER_JOINT
 from sim.robots.user import per_joint
 
@@ -24,6 +24,7 @@ _ISAAC_LAB_TERMS = {
     "height_scan": "scan",
     "gait_phase": "clock",
 }
+_NET_SETTINGS = ("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
 _IDEAL_DRIVE = {"saturation_effort": 1e6, "velocity_limit": 1e6}  # stands beside joints with a DC motor
 
 
@@ -75,13 +76,23 @@ def _read_actuators(groups: dict[str, Any], source: Source) -> None:
     """Gains, limits and delays."""
     notes: list[str] = []
     ideal = [name for name, group in groups.items() if group.get("saturation_effort") is None]
-    omitted = _IDEAL_DRIVE if len(ideal) == len(groups) else ()
+    omitted = [*_IDEAL_DRIVE] if len(ideal) == len(groups) else []
+    if nets := [name for name, group in groups.items() if group.get("network_file")]:
+        if len(groups) > 1:
+            raise ValueError(
+                f"{source.file}: the actuator network of {nets[0]} must drive all joints, got {len(groups)} groups"
+            )
+        net = groups[nets[0]]
+        settings = {key: net[key] for key in _NET_SETTINGS if net.get(key) not in (None, 1.0, "pos_vel")}
+        text = to_toml({"file": Path(net["network_file"]).name, **settings})
+        source.set(actuator_net=None, reason=f"{text}, with {net['network_file']} put beside it")
+        omitted += ["stiffness", "damping"]
     keys = [key for key in PER_JOINT[1:] if key not in omitted]
     values_by_key: dict[str, dict[str, Any]] = {key: dict.fromkeys(source.joints) for key in keys}
     for name, group in groups.items():
         drive = ("DelayedPDActuator", "PD gains with a limit") if name in ideal else ("DCMotor", "a DC motor")
         kind = str(group.get("class_type", "")).rpartition(":")[2]
-        if kind not in ("", "ImplicitActuator", "IdealPDActuator", drive[0]):
+        if kind not in ("", "ImplicitActuator", "IdealPDActuator", drive[0]) and name not in nets:
             notes.append(f"{name} is a {kind}, simulated as {drive[1]}")
         if group.get("friction"):
             notes.append(f"the friction of {name} is left out: give their joints a frictionloss")

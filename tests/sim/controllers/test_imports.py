@@ -318,6 +318,17 @@ def test_a_run_of_isaac_lab_3_is_read(tmp_path):
     assert controller.action_clip == ((pytest.approx(-4.0), pytest.approx(4.0)), (-5.0, 5.0)) * 4
 
 
+def test_an_actuator_network_of_isaac_lab_stands_in_place_of_gains(tmp_path):
+    old = ISAAC[ISAAC.index("      hips: ") : ISAAC.index("  height_scanner")]
+    net = "network_file: 'https://host/nets/go1.pt', pos_scale: -1.0, input_order: pos_vel, input_idx: [0, 1, 2]"
+    new = f"      legs: {{class_type: 'isaaclab:ActuatorNetMLP', joint_names_expr: [.*], effort_limit: 20.0, {net}}}\n"
+    with pytest.raises(ValueError, match="no gains for FL_hip"):
+        imported(isaac_lab(tmp_path / "run", old, new), tmp_path)
+    lines = (tmp_path / "mine/dog/robot.toml").read_text()
+    assert '{file = "go1.pt", pos_scale = -1.0, input_idx = [0, 1, 2]}, with https://host' in lines
+    assert "# stiffness" not in lines and "effort_limit = 20.0" in lines
+
+
 def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_taken(tmp_path, capsys):
     state = {"actor.0.weight": torch.zeros(8, 36), "actor.0.bias": torch.zeros(8)}
     torch.save({"model_state_dict": state}, tmp_path / "model_9.pt")

@@ -11,7 +11,7 @@ from sim.mujoco_c.crossing import EpisodeStates
 from sim.mujoco_c.model import crossing_model, to_mujoco
 from sim.robots.find import get_robot
 from sim.robots.robot import robot_digest
-from sim.robots.user import pack_robot
+from sim.robots.user import PackedRobot, pack_robot
 from tests.sim.dogs import write_dog
 from tests.sim.scenes import FLAT, put, simulate, standing
 
@@ -22,15 +22,15 @@ class Lstm(torch.nn.Module):
     def __init__(self):
         super().__init__()
         self.lstm, self.linear = torch.nn.LSTM(2, 4, 2, batch_first=True), torch.nn.Linear(4, 1)
-        self.register_buffer("in_scale", torch.tensor([[[3.0, 0.3]]]))
-        self.register_buffer("out_scale", torch.tensor([15.0]))
+        self.in_scale = torch.nn.Buffer(torch.tensor([[[3.0, 0.3]]]))
+        self.out_scale = torch.nn.Buffer(torch.tensor([15.0]))
 
     def forward(self, x: torch.Tensor, state: tuple[torch.Tensor, torch.Tensor]):
         x, state = self.lstm(self.in_scale * x, state)
         return self.out_scale * self.linear(x).squeeze(), state
 
 
-def make_dense(*sizes, activation=torch.nn.ELU):
+def make_dense(*sizes: int, activation: type[torch.nn.Module] = torch.nn.ELU):
     layers = [(torch.nn.Linear(*pair), activation()) for pair in pairwise(sizes)]
     return torch.nn.Sequential(*[part for layer in layers for part in layer][:-1])
 
@@ -53,7 +53,8 @@ def test_torques_are_those_of_the_module_in_both(tmp_path, device, kind):
         "dense": (make_dense(4, 8, 8, 1), "pos_scale=-2.0, input_order='vel_pos', input_idx=(0, 3)"),
     }[kind]
     robot = read_dog(tmp_path, module, settings, "\n    drive_delay_steps=1,")
-    assert resolved(robot)[0].actuator_net.decimation == {"lstm": 10, "dense": 5}[kind]  # of 1 ms
+    finer = resolved(robot)[0].actuator_net
+    assert finer is not None and finer.decimation == {"lstm": 10, "dense": 5}[kind]  # of 1 ms
     pose, targets = standing(robot, 2, z=5.0), np.random.default_rng(0).normal(size=(9, 2, 8))
     sim = simulate(robot, np.repeat(FLAT[None], 2, axis=0), device)
     for step in range(18):
@@ -82,7 +83,9 @@ def test_torques_are_those_of_the_module_in_both(tmp_path, device, kind):
 
 def test_its_file_is_hashed_and_goes_along(tmp_path):
     robot = read_dog(tmp_path / "a", make_dense(2, 1))
-    packed = pack_robot(robot).unpacked(tmp_path / "b")
+    packed = pack_robot(robot)
+    assert isinstance(packed, PackedRobot)
+    packed = packed.unpacked(tmp_path / "b")
     assert robot_digest(packed) == robot_digest(robot)
     assert robot_digest(read_dog(tmp_path / "a", make_dense(2, 1))) != robot_digest(packed)
 
