@@ -1,6 +1,8 @@
 """The network of a file: an rsl_rl checkpoint, a TorchScript module, or ONNX."""
 
 import functools
+import re
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -64,6 +66,22 @@ def find_widths(network: Any) -> tuple[int | None, int | None]:
     return None, None
 
 
+def _take_actions(output: Any) -> Any:
+    """The actions, which come first where a module returns more."""
+    return output[0] if isinstance(output, tuple) else output
+
+
+def _read_tensors(module: Any) -> dict[str, torch.Tensor]:
+    """Buffers of a module, and other tensors that its code names."""
+    tensors = dict(module.named_buffers())
+    for prefix, inner in module.named_modules():
+        for name in re.findall(r"\bself\.(\w+)", getattr(inner, "code", "")):
+            value = getattr(inner, name)
+            if isinstance(value, torch.Tensor) and not isinstance(value, torch.nn.Parameter):
+                tensors[f"{prefix}.{name}".lstrip(".")] = value
+    return tensors
+
+
 class _Script(torch.nn.Module):
     """A module without memory, whatever ``reset()`` its exporter gave it."""
 
@@ -72,11 +90,11 @@ class _Script(torch.nn.Module):
         self.module = module
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
-        return self.module(with_rows_of_zeros(rows))[: len(rows)]
+        return _take_actions(self.module(with_rows_of_zeros(rows)))[: len(rows)]
 
 
 class _RecurrentScript(Recurrent):
-    """A module that remembers one robot in its buffers, with a row of them for each robot."""
+    """A module that remembers one robot in its tensors, with a row of them for each robot."""
 
     def __init__(self, module: Any, initial: Mapping[str, torch.Tensor], axis: int) -> None:
         super().__init__([*initial.values()], axis)
@@ -87,7 +105,7 @@ class _RecurrentScript(Recurrent):
         owners = [functools.reduce(getattr, path[:-1], self.module) for path in self._paths]
         for owner, path, value in zip(owners, self._paths, state, strict=True):
             setattr(owner, path[-1], value)
-        action = self.module(rows)
+        action = _take_actions(self.module(rows))
         return action, [getattr(owner, path[-1]) for owner, path in zip(owners, self._paths, strict=True)]
 
 
@@ -95,26 +113,31 @@ class _RecurrentScript(Recurrent):
 def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: str) -> Any:
     """The module of a file, for rows of ``width`` columns, with a memory of each robot if it remembers one.
 
-    ``probe`` is a copy of the module on the CPU. The buffers that a call of it changes are the memory.
+    ``probe`` is a copy of the module on the CPU. The tensors that a call of it changes are the memory.
     """
     rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0))  # steps, robots
     reset = getattr(probe, "reset", getattr(probe, "reset_memory", None))
     if reset is not None:
         reset()
-    before = {name: value.clone() for name, value in probe.named_buffers()}
+    before = {name: value.clone() for name, value in _read_tensors(probe).items()}
     try:
-        first, second = (probe(rows[0, :1]) for _ in range(2))
+        outputs = [probe(rows[0, :1]) for _ in range(2)]
     except Exception:  # it takes another width, or has nothing to call: trying it later says so
         return _Script(module)
-    initial = {name: before[name] for name, value in probe.named_buffers() if not torch.equal(before[name], value)}
+    first, second = map(_take_actions, outputs)
+    if first is not outputs[0]:
+        what = f"returns {len(outputs[0])} values: the first are taken for actions, the others are ignored"
+        warnings.warn(f"policy '{path}' {what}", stacklevel=2)
+    after = _read_tensors(probe)
+    initial = {name: value for name, value in before.items() if not torch.equal(value, after[name])}
     if not isinstance(first, torch.Tensor) or not initial:
         is_same = reset is None or not isinstance(first, torch.Tensor) or torch.equal(first, second)
         return _Script(module) if is_same else module  # it has another memory
     separate = []
     for robot in rows.split(1, dim=1):
-        for name, value in probe.named_buffers():
+        for name, value in _read_tensors(probe).items():
             value.copy_(before[name])
-        separate.append(torch.cat([probe(row) for row in robot]))
+        separate.append(torch.cat([_take_actions(probe(row)) for row in robot]))
     for axis in (1, 0):  # the axis of robots is the one along which they act as they do alone
         if all(value.ndim > axis and value.shape[axis] == 1 for value in initial.values()):
             recurrent = _RecurrentScript(probe, initial, axis)

@@ -201,6 +201,30 @@ class Exported(torch.nn.Module):
         return self.layer(x)
 
 
+class Student(torch.nn.Module):
+    """A layer over two steps that are no buffer, with a second output."""
+
+    def __init__(self):
+        super().__init__()
+        self.past, self.layer = torch.zeros(1, 2, OBSERVATIONS), torch.nn.Linear(OBSERVATIONS, ACTIONS)
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        self.past = torch.cat([self.past[:, 1:], x[:, None]], dim=1)
+        return self.layer(self.past.mean(1)), self.past
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+def test_tensors_that_are_no_buffers_are_memory_and_the_first_output_acts(tmp_path, anymal):
+    student = Student()
+    torch.jit.script(student).save(str(tmp_path / "student.pt"))
+    with pytest.warns(UserWarning, match=r"student\.pt' returns 2 values"):
+        policy, rows = load_policy(tmp_path / "student.pt", anymal, "cpu"), rows_of(4)
+    assert find_memory(policy) is Memory.PER_ROBOT
+    policy.reset(torch.ones(4, dtype=torch.bool))
+    for mean in (rows / 2, rows):
+        torch.testing.assert_close(policy(rows), student.layer(mean).detach(), rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.filterwarnings("ignore:.torch.jit")
 def test_a_reset_that_does_nothing_is_no_memory(tmp_path, anymal):
     def load(kind):
