@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from sim.controllers.described import ControllerCfg, Described, read_controller
-from sim.controllers.formats.network import Policy, find_widths, load_network
+from sim.controllers.formats.network import Encoded, Policy, find_widths, load_network
 from sim.controllers.formats.rsl_rl import MlpPolicy, RnnPolicy
 from sim.controllers.runner import action_problem, reset_all
 from sim.controllers.spec import ControllerSpec, import_object, in_one_line, weights_file
@@ -147,12 +147,32 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
     if weights is None or not os.path.isfile(weights):
         raise ValueError(f"{path}: policy must name a file of weights beside it, got {cfg.policy!r}: put it there")
     label = f"{path} ({policy.columns})"
-    network = load_network(weights, device, sizes, label=label, activation=cfg.activation)
-    if cfg.activation is not None and not isinstance(network, MlpPolicy | RnnPolicy):
+    load = functools.partial(load_network, device=device, label=label, activation=cfg.activation)
+    network: Any = load(weights, sizes=sizes) if cfg.encoder is None else _load_encoded(policy, weights, path, load)
+    if cfg.activation is not None and not isinstance(network, MlpPolicy | RnnPolicy | Encoded):
         raise ValueError(f"{path}: activation is of an rsl_rl checkpoint; {weights.name} says its own: leave it out")
     _try_rows(network, sizes, device, str(weights), label)
     policy.use(network, torch.device(device))
     return policy
+
+
+def _load_encoded(policy: Described, weights: Path, path: Path, load: functools.partial[Any]) -> Encoded:
+    """The networks of two files; the policy sees the whole observation, or that of the present step."""
+    encoder = weights_file(path, "encoder")
+    if encoder is None or not os.path.isfile(encoder):
+        raise ValueError(
+            f"{path}: encoder must name a file of weights beside it, got {policy.cfg.encoder!r}: put it there"
+        )
+    size = policy.observation_size
+    newest = policy.find_newest()
+    width, count = find_widths(load(weights, sizes=None))[0], find_widths(load(encoder, sizes=None))[1]
+    columns = {size: range(size), len(newest): newest}.get((width or 0) - (count or 0))
+    if columns is None or not count:
+        what = f"encoder returns {count} columns and {weights.name} takes {width}"
+        must = f"beside them it must see all {size} of the observation, or {len(newest)} of a step"
+        raise ValueError(f"{path}: {what}: {must}")
+    networks = load(weights, sizes=(width, policy.num_actions)), load(encoder, sizes=(size, count))
+    return Encoded(*networks, columns, policy.cfg.encoder_first).to(load.keywords["device"])
 
 
 @torch.inference_mode()

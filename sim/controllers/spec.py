@@ -59,10 +59,13 @@ class ControllerSpec:
         """The Python file, the controller's file, and the files of its network, if any."""
         files = [Path(self.module)] if self.module is not None and self.module.endswith(".py") else []
         if self.file is not None:
-            files.append(Path(self.file))
-            if files[-1].suffix == ".toml":
-                files += filter(None, [weights_file(files[-1])])
-            files += filter(None, [agent_file(files[-1]), data_file(files[-1])])
+            networks = [Path(self.file)]
+            files += networks
+            if networks[0].suffix == ".toml":
+                networks = [*filter(None, (weights_file(files[-1], key) for key in ("policy", "encoder")))]
+                files += networks
+            for network in networks:
+                files += filter(None, [agent_file(network), data_file(network)])
         return tuple(files)
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
@@ -73,10 +76,10 @@ class ControllerSpec:
         return replace(self, module=module, file=self.file and str(folder / Path(self.file).name))
 
 
-def weights_file(path: Path) -> Path | None:
+def weights_file(path: Path, key: str = "policy") -> Path | None:
     """File of the weights that a description names, or of that name beside it; None if it cannot be read."""
     try:
-        policy = path.parent / tomllib.loads(path.read_text(encoding="utf-8"))["policy"]
+        policy = path.parent / tomllib.loads(path.read_text(encoding="utf-8"))[key]
         neighbour = path.parent / policy.name
         return neighbour if neighbour.is_file() and not policy.is_file() else policy
     except (OSError, ValueError, KeyError, TypeError, RecursionError):

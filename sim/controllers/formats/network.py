@@ -3,7 +3,7 @@
 import functools
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from sim.controllers.formats.rsl_rl import make_actor, read_weights
-from sim.controllers.runner import Recurrent, with_rows_of_zeros
+from sim.controllers.runner import Recurrent, is_graph_safe, with_rows_of_zeros
 from sim.controllers.spec import in_one_line
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -62,8 +62,33 @@ def find_widths(network: Any) -> tuple[int | None, int | None]:
         return network.sizes
     for weight in network.parameters():
         with suppress(Exception):  # of an inner layer
-            return weight.shape[1], network(torch.zeros(1, weight.shape[1], device=weight.device)).shape[1]
+            return weight.shape[1], _take_actions(network(torch.zeros(1, weight.shape[1], device=weight.device))).shape[
+                1
+            ]
     return None, None
+
+
+class Encoded(torch.nn.Module):
+    """A policy of some columns of the observation, and of what an encoder makes of them all."""
+
+    def __init__(self, policy: Any, encoder: Any, columns: Sequence[int], encoder_first: bool) -> None:
+        super().__init__()
+        self.policy = policy
+        self.encoder = encoder
+        self.columns = torch.nn.Buffer(torch.tensor(columns))
+        self._encoder_first = encoder_first
+        self.graph_safe = is_graph_safe(policy) and is_graph_safe(encoder)
+
+    def reset(self, rows: torch.Tensor) -> None:
+        """Begin anew where ``rows``, bool, shape (num_envs,), is true."""
+        for network in (self.policy, self.encoder):
+            if hasattr(network, "reset"):
+                network.reset(rows)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """Actions, shape (num_envs, num_joints)."""
+        seen = [rows[:, self.columns], self.encoder(rows)]
+        return self.policy(torch.cat(seen[::-1] if self._encoder_first else seen, dim=1))
 
 
 def _take_actions(output: Any) -> Any:

@@ -177,6 +177,36 @@ def test_the_past_is_laid_out_as_described(seen_by, layout, expected):
     np.testing.assert_array_equal(seen[1, 0], np.repeat(expected, 3))
 
 
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+@pytest.mark.parametrize(
+    ("layout", "line", "seen", "order"),
+    [
+        ('newest = "last", by = "row"', "", 12, slice(None)),  # what the policy sees of (before, now), then the latent
+        ('newest = "first", by = "term"', "", 6, slice(None)),
+        ('newest = "last", by = "row"', "encoder_first = true", 6, slice(None, None, -1)),
+    ],
+)
+def test_an_encoder_sees_the_observation_and_the_policy_that_or_the_present(
+    tmp_path, anymal, describe, layout, line, seen, order
+):
+    policy, encoder = torch.nn.Linear(seen + 2, ACTIONS), torch.nn.Linear(12, 2)
+    for name, network in (("weights.pt", policy), ("encoder.pt", encoder)):
+        torch.jit.script(network).save(str(tmp_path / name))
+    lines = (f'history = {{length = 2, fill = "zeros", {layout}}}', 'encoder = "encoder.pt"', line)
+    path = describe('{term = "gravity"}, {term = "command", scale = [2, 2, 0.25]}', *lines)
+    assert ControllerSpec.parse(path).files == (path, tmp_path / "weights.pt", tmp_path / "encoder.pt")
+    rows = rows_of(5)
+    now, zeros = rows[:, 6:12], torch.zeros(5, 3)
+    by_term = [now[:, :3], zeros, now[:, 3:], zeros]
+    whole = torch.cat([zeros, zeros, now] if "row" in layout else by_term, dim=1)
+    with torch.inference_mode():
+        action = policy(torch.cat([whole if seen == 12 else now, encoder(whole)][order], dim=1))
+        torch.testing.assert_close(load_policy(path, anymal, "cpu")(rows), action, rtol=1e-4, atol=1e-5)
+    torch.jit.script(torch.nn.Linear(12, 3)).save(str(tmp_path / "encoder.pt"))
+    with pytest.raises(ValueError, match="encoder returns 3 columns"):
+        load_policy(path, anymal, "cpu")
+
+
 @pytest.fixture
 def remembering(tmp_path, describe):
     """A description with all that a controller can remember."""
