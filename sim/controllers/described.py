@@ -473,18 +473,6 @@ class Described(torch.nn.Module):
         if history.fill == "first":
             past = torch.where(memory.steps[:, :, None] == 0.0, now[:, None], past)
         memory.past.copy_(past)
-        return self._lay_out(past, history)
-
-    def find_newest(self) -> list[int]:
-        """The network's columns of the present control step."""
-        if self.cfg.history is None:
-            return [*range(self.observation_size)]
-        marks = torch.zeros(1, max(self.lengths), sum(self.widths))
-        marks[:, 0] = 1.0
-        return self._lay_out(marks, self.cfg.history)[0].nonzero().flatten().tolist()
-
-    def _lay_out(self, past: torch.Tensor, history: History) -> torch.Tensor:
-        """The network's rows from observations, the newest first, shape (num_envs, length, width)."""
         blocks = [past] if history.by == "row" else past.split(self.widths, dim=2)
         steps = [block[:, :length] for block, length in zip(blocks, self.lengths, strict=False)]
         return torch.cat([(block.flip(1) if history.newest == "last" else block).flatten(1) for block in steps], dim=1)

@@ -164,7 +164,7 @@ def _load_encoded(policy: Described, weights: Path, path: Path, load: functools.
             f"{path}: encoder must name a file of weights beside it, got {policy.cfg.encoder!r}: put it there"
         )
     size = policy.observation_size
-    newest = policy.find_newest()
+    newest = _find_newest(policy)
     width, count = find_widths(load(weights, sizes=None))[0], find_widths(load(encoder, sizes=None))[1]
     columns = {size: range(size), len(newest): newest}.get((width or 0) - (count or 0))
     if columns is None or not count:
@@ -173,6 +173,21 @@ def _load_encoded(policy: Described, weights: Path, path: Path, load: functools.
         raise ValueError(f"{path}: {what}: {must}")
     networks = load(weights, sizes=(width, policy.num_actions)), load(encoder, sizes=(size, count))
     return Encoded(*networks, columns, policy.cfg.encoder_first).to(load.keywords["device"])
+
+
+def _find_newest(policy: Described) -> list[int]:
+    """The network's columns of the present control step."""
+    history = policy.cfg.history
+    blocks = zip(policy.widths, policy.lengths, strict=True)
+    if history is not None and history.by == "row":
+        blocks = [(sum(policy.widths), history.length)]
+    columns: list[int] = []
+    start = 0
+    for width, length in blocks:
+        first = start + (width * (length - 1) if history is not None and history.newest == "last" else 0)
+        columns += range(first, first + width)
+        start += width * length
+    return columns
 
 
 @torch.inference_mode()
