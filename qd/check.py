@@ -21,6 +21,7 @@ from qd.evaluate.level import (
     refuse_unless_walks,
 )
 from qd.search.directory import RUNS
+from qd.why import explain_walk
 from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import Crosser
 from qd.workers.invalid import refuse_all_invalid
@@ -39,6 +40,7 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
 _APART = 0.05  # share by which speeds may differ
+_OFF = 0.1  # share of its command by which a speed may miss it
 _MAX_CONTACTS = 1_000  # a robot that has more is refused
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _RISES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3)  # of kerbs and stairs [m]
@@ -49,10 +51,11 @@ _CROSSED = 0.8  # share of episodes that should reach the goal
 _TRIED = 100  # hard-random terrains at a height, one episode each: terrains differ more than their episodes
 
 
-def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute) -> bool:
+def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute, why: bool = False) -> bool:
     """Prints what a robot's files hold, whether it stands and walks, and which obstacles it crosses.
 
-    Without ``policy`` it walks by the controller beside its settings. Returns whether nothing has to be mended.
+    Without ``policy`` it walks by the controller beside its settings. If it walks badly, or with ``why``, the change of
+    its contract is named with which it walks best. Returns whether nothing has to be mended.
     """
     policy = policy or str(robot.policy_file)
     if has_controller := policy != str(robot.policy_file) or Path(policy).exists():
@@ -73,6 +76,8 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute)
         agree = fast - slow <= _APART * fast
         content = {"robot": robot, "walks": walks, "reaches_goal": reaches_goal, "agree": agree, "tolerance": _APART}
         print(_TEMPLATES.get_template("walking.txt").render(content).rstrip(), flush=True)
+        if why or not (reaches_goal and agree) or abs(slow - robot.speed) > _OFF * robot.speed:
+            explain_walk(robot, policy, compute)
         if not (reaches_goal and agree):
             return False
         height, share = find_fitting_height(crosser, policy)

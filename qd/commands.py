@@ -270,15 +270,27 @@ class CheckCommand(ControllerFlags, WorkerFlags):
     It prints joints and geoms as the solver holds them; whether the robot stands in its default pose, and how many
     contacts it has when it lies on rough ground; whether it walks on flat ground, here and in MuJoCo C; at which height
     of terrain it crosses about 80 %; and which kerbs and stairs stop it. The exit status is 1 if something must be
-    mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %.
+    mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %. Then, or with --why, it says
+    which one change of controller.toml or robot.toml makes it walk best, and the line to write.
     """
+
+    why: bool = False
+    """Say what to change even if it walks: robots walk side by side, each with one thing of the contract changed."""
+    trace: Path | None = None
+    """A log of the controller elsewhere, npz or csv, with a row a control step from an episode's start on: observation,
+    and any of action, lin_vel, ang_vel, gravity, command, joint_pos, joint_vel (docs/controllers.md). The first column,
+    step and size are named in which what its network sees, or does, differs from the contract; nothing else is done."""
 
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
         from qd.check import check_robot
+        from sim.controllers.trace import print_differences
 
+        robot = get_robot(self.robot)
+        if self.trace is not None:
+            return int(print_differences(self.trace, self.policy or str(robot.policy_file), robot))
         compute = _compute(self)
-        return 0 if check_robot(get_robot(self.robot), self.policy, compute=compute) else 1
+        return 0 if check_robot(robot, self.policy, compute=compute, why=self.why) else 1
 
 
 @dataclass(frozen=True, kw_only=True)

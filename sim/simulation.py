@@ -268,6 +268,11 @@ class Simulation:
         self.disturbed = make_zeros(Disturbed, self.device, row=rows, age=observed, former=former)
         self.disturbed.noise = make_struct(Noise, NoiseCfg())
 
+    def set_drive_delays(self, steps: np.ndarray) -> None:
+        """Let targets of each robot be late by so many physics steps, at most the robot's ``drive_delay_steps``."""
+        if self._delay.steps is not None:
+            self._delay.steps.assign(steps)
+
     def make_step(self, command: Any, action: Any) -> RobotStep:
         """A view of the robots at the end of a step that obeys the command (num_envs, 3) by the clipped action."""
         return make_struct(RobotStep, self, command=command, action=action, force_limit=self.robot.contact_force_limit)

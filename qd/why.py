@@ -1,0 +1,258 @@
+"""Why a controller does not walk: robots side by side, each with one thing of the contract changed, and what is best.
+
+A contract is what controller.toml and robot.toml say. Networks walk best by that which they were trained with.
+"""
+
+import itertools
+import re
+from collections.abc import Iterator
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qd.workers.compute import Compute
+from sim.controllers.described import ControllerCfg, Described, Term, read_controller
+from sim.controllers.spec import weights_file
+from sim.files.settings import to_toml
+from sim.robots.compiled import read_drives, read_robot_file, robot_spec
+from sim.robots.robot import RobotCfg
+from sim.trials import MEASURES, Variant, walk_variants
+
+_FIRST_S, _SECOND_S = 3.6, 4.5  # time that robots walk in the two rounds [s]
+_KEPT, _REPLICAS = 16, 4  # changes in the second round, and episodes of each
+_LEAST_GAIN = 0.03  # of the score for which a change is named
+_FACTORS = (0.05, 0.25, 0.5, 2.0, 4.0, 20.0, -1.0)
+_COMMAND_FACTORS = ((2.0, 2.0, 0.25), (0.5, 0.5, 4.0))
+_ALL_PAIRS = 16  # joints up to which all pairs of them are swapped
+_LIMB = re.compile(r"(?i)(?<![a-z])(fl|fr|rl|rr|hl|hr|lf|rf|lh|rh|left|right|l|r)(?![a-z])")
+_GAINS = ("stiffness", "damping", "effort_limit", "armature")
+
+
+class Change(NamedTuple):
+    """One thing of a contract that may be otherwise, and how robots walk with it."""
+
+    text: str
+    variant: Variant
+    score: float = 0.0
+    measures: NDArray[np.float64] = np.zeros(len(MEASURES))
+
+
+def write_out(cfg: ControllerCfg, robot: RobotCfg) -> ControllerCfg:
+    """The description with what it leaves out: joints, pose, and a number for each column and joint."""
+    joints = cfg.joints or robot.joint_names
+    pose = dict(zip(robot.joint_names, robot.default_joint_pos, strict=True))
+    widths = Described(cfg, robot, "controller.toml").widths
+    terms = [
+        replace(term, scale=tuple(np.broadcast_to(term.scale, width).astype(float).tolist()))
+        for term, width in zip(cfg.observation, widths, strict=True)
+    ]
+    scale = tuple(np.broadcast_to(cfg.action_scale, len(joints)).astype(float).tolist())
+    default = cfg.default or tuple(pose[name] for name in joints)
+    return replace(cfg, joints=joints, default=default, action_scale=scale, observation=tuple(terms))
+
+
+def propose_changes(base: Variant) -> list[Change]:
+    """Changes of one thing each, without those that change nothing; the description of ``base`` is written out."""
+    descriptions = itertools.chain(_change_terms(base.controller), _change_actions(base.controller, base.robot))
+    variants = [(text, replace(base, controller=cfg)) for text, cfg in descriptions]
+    changes = [Change(*change) for change in [*variants, *_change_drives(base)] if change[1] != base]
+    first = {repr(change.variant): change for change in changes[::-1]}  # of those that come twice
+    return [*first.values()][::-1]
+
+
+def _times(values: Any, factors: Any) -> tuple[float, ...]:
+    return tuple((np.array(values) * factors + 0.0).tolist())
+
+
+def _scale_term(cfg: ControllerCfg, k: int, factors: Any) -> ControllerCfg:
+    terms = list(cfg.observation)
+    terms[k] = replace(terms[k], scale=_times(terms[k].scale, factors))
+    return replace(cfg, observation=tuple(terms))
+
+
+def _change_terms(cfg: ControllerCfg) -> Iterator[tuple[str, ControllerCfg]]:
+    """Scales, signs and order of terms, and of the history."""
+    for k, term in enumerate(cfg.observation):
+        factors = [*_FACTORS, *_COMMAND_FACTORS] if term.term == "command" else _FACTORS
+        for factor in factors if term.term not in ("gravity", "clock", "constant") else ():
+            yield f"{term.term} x {factor}", _scale_term(cfg, k, factor)
+        if term.term in ("lin_vel", "ang_vel", "gravity"):
+            for signs in itertools.product((1.0, -1.0), repeat=3):
+                axes = "".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0.0)
+                yield f"signs of {axes} of {term.term}", _scale_term(cfg, k, signs)
+    for i, j in itertools.combinations(range(len(cfg.observation)), 2):
+        terms = list(cfg.observation)
+        terms[i], terms[j] = terms[j], terms[i]
+        yield f"order of {terms[j].term} and {terms[i].term}", replace(cfg, observation=tuple(terms))
+    for name, value in (("newest", "first"), ("newest", "last"), ("by", "row"), ("by", "term"), ("fill", "first")):
+        if cfg.history is not None and not (name == "by" and len({term.history for term in cfg.observation}) > 1):
+            yield f"history.{name}", replace(cfg, history=replace(cfg.history, **{name: value}))
+
+
+def _change_actions(cfg: ControllerCfg, robot: RobotCfg) -> Iterator[tuple[str, ControllerCfg]]:
+    """Scale, delay and pose of actions, and the order and directions of joints."""
+    joints, count = list(cfg.joints or ()), len(cfg.joints or ())
+    default, scale = cfg.default or (), cfg.action_scale
+    for factor in (0.25, 0.5, 2.0, 4.0, -1.0):
+        yield f"action_scale x {factor}", replace(cfg, action_scale=_times(scale, factor))
+    for steps in range(3):
+        yield "action_delay_steps", replace(cfg, action_delay_steps=steps)
+    home = read_robot_file(robot.model_file).home
+    for pose in filter(None, (robot.default_joint_pos, home, (0.0,) * robot.num_joints)):
+        values = tuple(float(pose[robot.joint_names.index(name)]) for name in joints)
+        for name, angles, offset in (
+            ("default", values, cfg.action_offset),
+            ("default beside action_offset", values, cfg.action_offset or default),
+            ("action_offset", default, values),
+        ):
+            yield name, replace(cfg, default=angles, action_offset=None if offset == angles else offset)
+    for j, joint in enumerate(joints):
+        flip = np.where(np.arange(count) == j, -1.0, 1.0)
+        yield f"sign of the action of {joint}", replace(cfg, action_scale=_times(scale, flip))
+        turned = replace(cfg, action_scale=_times(scale, flip), default=_times(default, flip))
+        for k, term in enumerate(cfg.observation):
+            if term.term in ("joint_pos", "joint_vel") and term.joints is None:
+                turned = _scale_term(turned, k, flip)
+                yield f"sign of {term.term} of {joint}", _scale_term(cfg, k, flip)
+        yield f"direction of {joint}", turned
+    limbs = [match[0] if (match := _LIMB.search(name)) else "" for name in joints]
+    kinds = [_LIMB.sub("", name) for name in joints]
+    for i, j in itertools.combinations(range(count), 2):
+        if count <= _ALL_PAIRS or kinds[i] == kinds[j] or limbs[i] == limbs[j]:
+            names = [*joints[:i], joints[j], *joints[i + 1 : j], joints[i], *joints[j + 1 :]]
+            yield f"order of {joints[i]} and {joints[j]}", replace(cfg, joints=tuple(names))
+    by_kind = sorted(range(count), key=lambda j: kinds.index(kinds[j]))
+    by_limb = sorted(range(count), key=lambda j: limbs.index(limbs[j]))
+    for order in (by_kind, by_limb, sorted(range(count), key=joints.__getitem__)):
+        yield "order of joints", replace(cfg, joints=tuple(joints[j] for j in order))
+    different = [*dict.fromkeys(filter(None, limbs))]
+    for permuted in itertools.permutations(different) if len(different) <= 4 else ():
+        others = dict(zip(different, permuted, strict=True))
+        names = [_LIMB.sub(lambda match, others=others: others[match[0]], name) for name in joints]
+        if set(names) == set(joints):
+            yield "order of limbs", replace(cfg, joints=tuple(names))
+
+
+def _change_drives(base: Variant) -> Iterator[tuple[str, Variant]]:
+    """Gains, limits and delay of drives, and time steps."""
+    robot = base.robot
+    for changed, factor in itertools.product(((0,), (1,), (0, 1), (2,), (3,)), (0.5, 2.0)):
+        gains = tuple(gain * factor if k in changed else gain for k, gain in enumerate(base.gains))
+        yield f"{' and '.join(_GAINS[k] for k in changed)} x {factor}", replace(base, gains=gains)
+    for steps in (0, max(robot.decimation // 2, 1), robot.decimation, 2 * robot.decimation):
+        yield "drive_delay_steps", replace(base, robot=replace(robot, drive_delay_steps=steps))
+    for decimation in (robot.decimation / 2.0, 2.0 * robot.decimation):
+        if decimation == int(decimation):
+            yield "decimation", replace(base, robot=replace(robot, decimation=int(decimation)))
+
+
+def rank_changes(base: Variant, weights: Path, *, device: str) -> list[Change]:
+    """Lets robots walk with each change, and longer with the best; those, the best first, ``nothing`` among them."""
+    base = replace(base, controller=write_out(base.controller, base.robot))
+    changes = [Change("nothing", base), *propose_changes(base)]
+    variants = [change.variant for change in changes]
+    walks = walk_variants(variants, weights, device=device, seconds=_FIRST_S, replicas=1)
+    scores = [
+        float(np.mean(score_walks(walk, change.variant.robot))) for walk, change in zip(walks, changes, strict=True)
+    ]
+    best = sorted({0, *np.argsort(-np.array(scores), kind="stable")[:_KEPT].tolist()})
+    variants = [variants[k] for k in best]
+    walks = walk_variants(variants, weights, device=device, seconds=_SECOND_S, replicas=_REPLICAS, seed=1)
+    ranked = []
+    for k, walk in zip(best, walks, strict=True):
+        score = float(np.mean(score_walks(walk, changes[k].variant.robot)))
+        ranked.append(changes[k]._replace(score=score, measures=np.nan_to_num(walk).mean(axis=0)))
+    return sorted(ranked, key=lambda change: -change.score)
+
+
+def score_walks(walks: NDArray[np.float64], robot: RobotCfg) -> NDArray[np.float64]:
+    """How well episodes walk, by their measures (num_episodes, num_measures); more is better."""
+    measures = dict(zip(MEASURES, walks.T, strict=True))
+    rate = measures["action_rate"] * 0.02 / robot.control_dt
+    costs = measures["velocity_error"] / robot.speed + 0.2 * measures["roll_pitch_rate"] + 0.2 * rate + measures["tilt"]
+    return -5.0 * (1.0 - measures["alive"]) - np.nan_to_num(costs, nan=8.0)
+
+
+def explain_walk(robot: RobotCfg, policy: str, compute: Compute) -> None:
+    """Prints which change of the contract makes a controller walk best, and the line that makes it."""
+    path = Path(policy)
+    is_data = path.suffix == ".toml"
+    weights = weights_file(path) if is_data else path
+    if weights is None or not weights.is_file():
+        print(f"What is wrong can be found of a controller.toml or of weights, got {policy}.")
+        return
+    base = Variant(controller=read_controller(path) if is_data else _describe_row(robot), robot=robot)
+    print("\n".join(describe_ranked(base, rank_changes(base, weights, device=compute.device))), flush=True)
+
+
+def _describe_row(robot: RobotCfg) -> ControllerCfg:
+    """The description of weights that see the robot's row (docs/controllers.md)."""
+    scales = {"lin_vel": 2.0, "ang_vel": 0.25, "gravity": 1.0, "command": (2.0, 2.0, 0.25), "joint_pos": 1.0}
+    scales |= {"joint_vel": 0.05, "last_action": 1.0}
+    terms = [Term(term=name, scale=scale) for name, scale in scales.items()]
+    if robot.num_scan_points:
+        terms.append(Term(term="scan", order="y fastest", offset=0.5, clip=1.0, scale=5.0))
+    return ControllerCfg(policy="", action_scale=robot.action_scale, action_clip=100.0, observation=tuple(terms))
+
+
+def describe_ranked(base: Variant, ranked: list[Change]) -> Iterator[str]:
+    """Lines about the best changes: what to write where, and how robots walk with each."""
+    now = next(change for change in ranked if change.text == "nothing")
+    best = [change for change in ranked if change is not now][:3]
+    if best[0].score < now.score + _LEAST_GAIN:
+        yield "No change of one thing of its contract makes it walk better. The nearest:"
+    else:
+        yield f"It walks best with another {best[0].text}: {describe_setting(base, best[0].variant)}"
+    for change in [*best, now]:
+        numbers = dict(zip(MEASURES, change.measures, strict=True))
+        walks = f"{numbers['speed']:.2f} m/s of {base.robot.speed:g}, error {numbers['velocity_error']:.2f} m/s, alive"
+        setting = "" if change is now else f"; {describe_setting(base, change.variant)}"
+        yield f"  {change.text}: {walks} {numbers['alive']:.0%} of the time, score {change.score:.2f}{setting}"
+
+
+def describe_setting(base: Variant, variant: Variant) -> str:
+    """The lines to write where a variant differs from the base, and the file."""
+    settings: dict[str, Any] = {}
+    if variant.gains != base.gains:
+        model = robot_spec(base.robot).compile()
+        drives = read_drives(model)
+        values = (drives.stiffness, drives.damping, drives.effort, model.dof_armature[6:])
+        changed = [k for k in range(4) if variant.gains[k] != base.gains[k]]
+        settings = {_GAINS[k]: _shorten((values[k] * variant.gains[k]).tolist()) for k in changed}
+    settings |= _differences(base.robot, variant.robot)
+    if settings:
+        return "in robot.toml write " + " and ".join(f"{name} = {to_toml(value)}" for name, value in settings.items())
+    before = write_out(base.controller, base.robot)
+    lines = []
+    for name, value in _differences(before, variant.controller).items():
+        if name == "observation":
+            for k, (term, former) in enumerate(zip(value, before.observation, strict=True)):
+                if term != former:
+                    lines.append(f"as term {k + 1} of observation {to_toml(_plain(term))}")
+        else:
+            lines.append(f"{name} = {to_toml(_shorten(value) if name == 'action_scale' else _plain(value))}")
+    return f"in controller.toml write {' and '.join(lines)}"
+
+
+def _differences(before: Any, after: Any) -> dict[str, Any]:
+    names = [field.name for field in fields(before)]
+    return {name: getattr(after, name) for name in names if getattr(after, name) != getattr(before, name)}
+
+
+def _plain(value: Any) -> Any:
+    """A term or history as a table, without what is left out."""
+    if not hasattr(value, "__dataclass_fields__"):
+        return value
+    named = {field.name: getattr(value, field.name) for field in fields(value)}
+    named |= {"scale": _shorten(named["scale"])} if "scale" in named else {}
+    defaults = {field.name: field.default for field in fields(value) if field.default is not MISSING}
+    return {name: content for name, content in named.items() if name not in defaults or content != defaults[name]}
+
+
+def _shorten(values: Any) -> Any:
+    """One number in place of as many equal ones."""
+    values = [float(f"{value:.6g}") for value in np.ravel(values)]
+    return values[0] if len({*values}) == 1 else values

@@ -1,0 +1,112 @@
+"""Ten errors planted into the contracts of public controllers, and whether `faultline check` names them: planted.json.
+
+Each ROBOT is the robot.toml of an import, beside its controller.toml, of a controller that walks. An error that changes
+the speed on level ground by under 3 % is replaced by the next of its kind, or by a spare one, and the file says so.
+"""
+
+import argparse
+import json
+import re
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qd.why import Change, describe_ranked, propose_changes, rank_changes, write_out
+from sim.controllers.described import read_controller
+from sim.controllers.spec import controller_identity, weights_file
+from sim.device import resolve_device
+from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.provenance import provenance
+from sim.robots.find import get_robot
+from sim.trials import MEASURES, Variant, walk_variants
+
+ERRORS = {
+    "one sign": r"sign of the action|direction of",
+    "two joints swapped": r"order of \S+_\S+ and \S+_\S+$",
+    "action scale": r"action_scale x 0\.5$",
+    "gyro frame": r"signs of .* of ang_vel$",
+    "order of history": r"history\.(newest|by)",
+    "default pose": r"default$",
+    "position gain": r"stiffness x 2\.0$",
+    "delay": r"action_delay_steps$",
+    "command scale": r"command x (0\.5|2\.0)$",
+    "time step": r"decimation$",
+}
+"""Ten kinds by the changes of :func:`qd.why.propose_changes` that are of the kind."""
+SPARES = (r"(joint_vel|joint_pos|last_action) x (0\.25|4\.0)$", r"order of (lin_vel|ang_vel|gravity) and", r"damping x")
+"""Kinds in place of those that a controller does not have, or that change nothing."""
+LEAST_CHANGE = 0.03
+
+
+def walk_speed(variant: Variant, weights: Path, device: str) -> float:
+    """Mean speed over the time, 0 where the robot falls [m/s]."""
+    (walks,) = walk_variants([variant], weights, device=device, seconds=6.0, replicas=8, seed=2)
+    alive, speed = (np.nan_to_num(walks[:, MEASURES.index(name)]) for name in ("alive", "speed"))
+    return float(np.mean(np.where(alive == 1.0, speed, 0.0)))
+
+
+def plant_errors(
+    base: Variant, weights: Path, device: str, seed: int
+) -> Iterator[tuple[str, Change, float, list[str]]]:
+    """Kind, error, speed with it [m/s], and the errors that it stands for since they change too little."""
+    changes, rng = propose_changes(base), np.random.default_rng(seed)
+    speed, spares = walk_speed(base, weights, device), iter(SPARES)
+    for kind, pattern in ERRORS.items():
+        replaced: list[str] = []
+        while True:
+            options = [change for change in changes if re.match(pattern, change.text)]
+            for number in rng.permutation(len(options))[:4]:
+                other = walk_speed(options[number].variant, weights, device)
+                if abs(other - speed) >= LEAST_CHANGE * speed:
+                    yield kind, options[number], other, replaced
+                    break
+                replaced.append(f"{options[number].text}: {other:.3f} m/s of {speed:.3f}")
+            else:
+                replaced += [] if options else ["it has none"]
+                pattern = next(spares)
+                continue
+            break
+
+
+def measure(file: Path, device: str, seed: int) -> dict[str, Any]:
+    """What is named for each planted error of a robot.toml."""
+    robot, path = get_robot(str(file)), file.with_name("controller.toml")
+    weights = weights_file(path)
+    assert weights is not None
+    base = Variant(controller=write_out(read_controller(path), robot), robot=robot)
+    rows = []
+    for kind, error, speed, replaced in plant_errors(base, weights, device, seed):
+        started = time.perf_counter()
+        ranked = rank_changes(error.variant, weights, device=device)
+        lines = list(describe_ranked(error.variant, ranked))
+        rank = next((k for k, change in enumerate(ranked, 1) if change.variant == base), None)
+        named = ranked[0].variant == base and lines[0].startswith("It walks best")
+        row = {"kind": kind, "planted": error.text, "replaced": replaced, "speed": speed, "named": named, "rank": rank}
+        rows.append(row | {"first_line": lines[0], "wall_s": time.perf_counter() - started})
+        print(json.dumps(rows[-1]), flush=True)
+    return {**controller_identity(robot, str(path)), "named": sum(row["named"] for row in rows), "errors": rows}
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Plants errors into every controller that is named, and writes the file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("robots", type=Path, nargs="+", metavar="ROBOT")
+    parser.add_argument("--device", help="a CUDA device if there is one")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("results/planted.json"))
+    args = parser.parse_args(argv)
+    device = resolve_device(args.device)
+    prepare_output(args.out)
+    content = provenance(device, args.seed)
+    content["controllers"] = {file.parent.name: measure(file, device, args.seed) for file in args.robots}
+    content["named"] = sum(numbers["named"] for numbers in content["controllers"].values())
+    content["planted"] = sum(len(numbers["errors"]) for numbers in content["controllers"].values())
+    write_atomically(args.out, to_json(content))
+    return content
+
+
+if __name__ == "__main__":
+    main()
