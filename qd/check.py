@@ -111,8 +111,7 @@ def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute, *, skip_
         refuse_unless_walks(robot, policy, compute)
     if not has_scales:
         print(f"There are no penalty scales of robot '{robot.name}' as it is: they are measured first.", flush=True)
-        terrains = 1_000 if compute.device.startswith("cuda") else 100
-        calibrate(robot, policy, compute=compute, terrains=terrains, replicas=4)
+        calibrate(robot, policy, compute=compute, terrains=4_000 if compute.on_gpu else 400, replicas=1)
     return robot
 
 
@@ -154,19 +153,24 @@ def _half_label(dose: dict[str, Any], element: str) -> str:
     return f"of over {100 * _RISES[-1]:.0f} cm" if is_over else f"of less than {100 * _RISES[0]:.0f} cm"
 
 
-def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
+def find_fitting_height(crosser: Crosser, policy: str, *, room: int = 0) -> tuple[float, float]:
     """The largest height [m] at which a controller crosses 80 % of hard-random terrains, and the share at that height.
 
     Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
-    ground, fails everywhere on it, and a search says nothing. The least height is 2 cm.
+    ground, fails everywhere on it, and a search says nothing. The least height is 2 cm. All heights are tried at once on a GPU, else one after the
+    other. ``room`` is as :meth:`qd.workers.crosser.Crosser.cross` takes it.
     """
     shares = dict[float, float]()
 
     def fails(height: float) -> bool:
-        label = f"hard-random terrains of height {height:g} m"
-        result = crosser.cross(policy, _draw_terrains(_TRIED, height), replicas=1, label=label)
-        refuse_all_invalid(result)
-        shares[height] = float(result.reached_goal[~result.invalid].mean())
+        if height not in shares:
+            heights = _HEIGHTS if crosser.compute.on_gpu else (height,)
+            terrains = Terrains.join([_draw_terrains(_TRIED, tried) for tried in heights])
+            label = f"hard-random terrains up to {heights[-1]:g} m"
+            result = crosser.cross(policy, terrains, replicas=1, label=label, room=room)
+            refuse_all_invalid(result)
+            counts = [values.reshape(len(heights), -1).sum(axis=1) for values in (result.reached_goal, ~result.invalid)]
+            shares.update(zip(heights, (counts[0] / np.maximum(counts[1], 1)).tolist(), strict=True))
         print(f"Height {height:g} m: {shares[height]:.0%} of episodes reach the goal.", flush=True)
         return shares[height] < _CROSSED
 
@@ -177,10 +181,13 @@ def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
 
 
 def _draw_terrains(count: int, height: float | None) -> Terrains:
-    """Hard-random terrains with their seeds, drawn row by row: the first ones of more are those of fewer."""
+    """Hard-random terrains with their seeds, drawn row by row: the first ones of more are those of fewer.
+
+    All heights are of one space, so that one simulation crosses them.
+    """
     seeds = np.random.SeedSequence(0).generate_state(count, np.uint32)
-    space = SUPER_GAUSSIAN if height is None else at_height(SUPER_GAUSSIAN, height)
-    return Terrains(genes=SUPER_GAUSSIAN.hard_random(count, 0), seeds=seeds, space=space)
+    genes = SUPER_GAUSSIAN.hard_random(count, 0)
+    return Terrains(genes=genes if height is None else SUPER_GAUSSIAN.scaled(genes, height / MAX_HEIGHT), seeds=seeds)
 
 
 def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, replicas: int) -> dict[str, Any]:
@@ -195,7 +202,8 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     prepare_output(out)
     results: list[RolloutResult] = []
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
-        height = None if robot.settings_file is None else find_fitting_height(crosser, policy)[0]
+        room = terrains if replicas == 1 else 0
+        height = None if robot.settings_file is None else find_fitting_height(crosser, policy, room=room)[0]
         drawn = _draw_terrains(_MAX_ROUNDS * terrains, height)
         for first in range(0, len(drawn), terrains):
             label = f"hard-random terrains from {first + 1:,}"
@@ -204,7 +212,11 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
             if scales["failing_episodes"] >= _ENOUGH:
                 break
             print("{failing_episodes} of {episodes} episodes did not reach the goal.".format(**scales), flush=True)
-    origin = {**compute.origin(0), **controller_identity(robot, policy), "space": drawn.space.name}
+    origin = {
+        **compute.origin(0),
+        **controller_identity(robot, policy),
+        "space": at_height(SUPER_GAUSSIAN, height or MAX_HEIGHT).name,
+    }
     crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
     report = {**origin, "crossing": crossing, **scales}
     absent = [name for name in robot.penalties if name not in report["scales"]]

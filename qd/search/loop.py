@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from qd.check import ensure_ready
 from qd.search.archive import Archive
 from qd.search.directory import Metrics, RunDirectory, claimed
-from qd.search.fitness import evaluate_rollout, join_evaluations
+from qd.search.fitness import FAILING_GOAL_RATE, evaluate_rollout, join_evaluations
 from qd.search.progress import Bar
 from qd.search.results import (
     build_archive,
@@ -29,7 +29,7 @@ from qd.workers.invalid import WARNED_SHARE, format_reasons, refuse_all_invalid
 from qd.workers.pipeline import Pipeline, PipelineCfg
 from qd.workers.seeds import episode_seeds
 from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
-from sim.files.command import Interrupted, command_line, say
+from sim.files.command import BEGAN, Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -161,6 +161,7 @@ def _run_iterations(
             seeds = episode_seeds(cfg.seed, iteration, cfg.scheduler.num_terrains)[scheduler.group_rows(group)]
             pipeline.put(Terrains(genes=genes, seeds=seeds[: len(genes)], space=space))
 
+    has_failing = bool(metrics)
     pipeline.clear()
     began = time.perf_counter()
     for group in range(num_groups):
@@ -172,6 +173,10 @@ def _run_iterations(
             results.append(pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups)))
             refuse_all_invalid(results[-1])
             evaluations.append(evaluate_rollout(results[-1], cfg.cells, cfg.fitness))
+            is_failing = evaluations[-1].goal_rate < FAILING_GOAL_RATE
+            if not has_failing and is_failing.any():
+                has_failing, seconds = True, time.monotonic() - BEGAN
+                print(f"The first failing terrains after {seconds:.0f} s: {is_failing.sum()} of {len(is_failing)}.")
             emitters_began = time.perf_counter()
             num_new += scheduler.tell(evaluations[-1], iteration, group)
             genes = ask(group, iteration + 1)

@@ -13,6 +13,7 @@ import signal
 import sys
 import textwrap
 import threading
+import time
 import traceback
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
@@ -88,6 +89,10 @@ class EliteFlags(SpaceFlag):
     minimal: str | None = None
     """Instead of whole elites, the minimal terrains that `faultline minimise` left of them: numbers of the elites, as
     --elite has them; all are those that have one."""
+
+
+BEGAN = time.monotonic()
+"""When the program began [s]."""
 
 
 class UserError(Exception):
