@@ -157,8 +157,8 @@ def find_fitting_height(crosser: Crosser, policy: str, *, room: int = 0) -> tupl
     """The largest height [m] at which a controller crosses 80 % of hard-random terrains, and the share at that height.
 
     Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
-    ground, fails everywhere on it, and a search says nothing. The least height is 2 cm. All heights are tried at once on a GPU, else one after the
-    other. ``room`` is as :meth:`qd.workers.crosser.Crosser.cross` takes it.
+    ground, fails everywhere on it, and a search says nothing. The least height is 2 cm. All heights are tried at once
+    on a GPU, else one after the other. ``room`` is as :meth:`qd.workers.crosser.Crosser.cross` takes it.
     """
     shares = dict[float, float]()
 
