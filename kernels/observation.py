@@ -78,9 +78,7 @@ def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: 
 @wp.func
 def _sense_column(step: RobotStep, sensors: Sensors, env: int, k: int) -> float:
     if k < sensors.num_pose:
-        if k < 3:
-            return step.joint_q[env, k]
-        return step.joint_q[env, 3 + k % 4]  # w is the last there: column 3 is w, 4 to 6 are xyz
+        return step.joint_q[env, wp.where(k < 3, k, 3 + k % 4)]  # from xyzw: column 3 is w, 4 to 6 are xyz
     foot = k - sensors.num_pose
     num_feet = sensors.foot_columns.shape[0]
     if foot < num_feet:
@@ -109,9 +107,7 @@ def noise_width(noise: Noise, sensors: Sensors, k: int) -> float:
     sense = k - NUM_BASE_COLUMNS - 3 * num_joints - sensors.scan_x.shape[0]
     if sense < 0:
         return noise.scan * SCAN_SCALE
-    if sense >= 3 and sense < sensors.num_pose:
-        return 0.5 * noise.gravity
-    return 0.0
+    return wp.where(sense >= 3 and sense < sensors.num_pose, 0.5 * noise.gravity, 0.0)
 
 
 @kernel_over("observation_out")

@@ -196,14 +196,11 @@ class Simulation:
         num_pose, num_feet, num_torques = robot.sense_sizes
         scan_x, scan_y = robot.scan_points()
         arrays = {"default_joint_pos": robot.default_joint_pos, "scan_x": scan_x, "scan_y": scan_y}
-        feet = np.arange(len(robot.geom_names))[len(robot.geom_names) - num_feet :]
-        self.sensors = make_struct(
-            Sensors,
-            num_pose=num_pose,
-            foot_columns=wp.array(feet, dtype=int),
-            torque_columns=wp.array(columns[:num_torques] - 1, dtype=int),
-            **{name: wp.array(row, dtype=float) for name, row in arrays.items()},
-        )
+        numbers = {name: wp.array(row, dtype=float) for name, row in arrays.items()}
+        feet = len(robot.geom_names) - num_feet + np.arange(num_feet)
+        indices = {"foot_columns": feet, "torque_columns": columns[:num_torques] - 1}
+        numbers |= {name: wp.array(row, dtype=int) for name, row in indices.items()}
+        self.sensors = make_struct(Sensors, num_pose=num_pose, **numbers)
         bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
         self._coordinates = make_struct(
             SolverState,

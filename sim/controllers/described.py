@@ -15,28 +15,19 @@ from msgspec import Meta
 from kernels.observation import ANG_VEL_SCALE, FORCE_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE, SCAN_OFFSET, SCAN_SCALE
 from sim.controllers.formats.rsl_rl import ACTIVATIONS
 from sim.controllers.runner import is_graph_safe
-from sim.files.settings import (
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    from_builtins,
-    read_toml,
-    to_toml,
-)
+from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, read_toml, to_toml
 from sim.robots.robot import RobotCfg, needed_senses
 
 TERMS: dict[str, tuple[str, ...]] = {
     "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit",), "joint_pos": ("joints",),
     "joint_vel": ("joints",), "last_action": (), "clock": ("period_s", "order", "offset"),
     "constant": ("value",), "rpy": ("axes",), "heading": (), "quat": ("order",), "base_pos": (),
-    "contacts": ("threshold", "feet"), "torques": ("joints",), "scan": ("order", "x", "y", "offset"),
+    "contacts": ("threshold",), "torques": ("joints",), "scan": ("order", "x", "y", "offset"),
 }  # fmt: skip
 """Fields of each term besides those of all terms; docs/controllers.md explains them."""
-_REQUIRED = {"clock": {"period_s"}, "scan": {"order"}, "constant": {"value"}, "rpy": {"axes"}, "quat": {"order"}}
-_AXES = ("roll", "pitch", "yaw")
-_CLOCK = "sin cos"
 _ORDERS = {"scan": "(x|y) fastest", "clock": "(sin|cos)( (sin|cos))?", "quat": "w x y z|x y z w"}
+_COLUMNS = {"roll": 0, "pitch": 1, "yaw": 2, "w": 0, "x": 1, "y": 2, "z": 3}
+"""Columns of axes in the base's angles, and in a quaternion."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,22 +51,19 @@ class Term:
     period_s: PositiveFloat | None = None
     """Period of a clock [s]."""
     order: str | None = None
-    """Of a scan's points: "x fastest" or "y fastest"; of a quaternion: "w x y z" or "x y z w"; of a clock: "sin cos" of
-    all feet (if None), "cos sin", "sin" or "cos"."""
+    """Of a scan's points "x fastest" or "y fastest", of a quaternion "w x y z" or "x y z w", of a clock "sin cos"."""
     x: tuple[float, ...] | None = None
     """Points of a scan ahead of the base, yaw frame [m]; the robot's ``scan_x`` if None."""
     y: tuple[float, ...] | None = None
     """Left of it [m]; the robot's ``scan_y`` if None."""
     offset: float | tuple[float, ...] | None = None
-    """Subtracted from the height of the base over the ground [m]; of a clock: the start of each foot in periods."""
+    """Subtracted from the height of the base over the ground [m]; of a clock: that of each foot, in periods."""
     value: float | tuple[float, ...] = 0.0
     """Numbers that never change."""
     axes: Annotated[str, Meta(pattern="^(roll|pitch|yaw)( (roll|pitch|yaw))*$")] | None = None
     """Angles of the base that are seen, in their order."""
-    threshold: NonNegativeFloat | None = None
+    threshold: PositiveFloat | None = None
     """A foot with a larger force [N] is 1, else 0; the force itself if None."""
-    feet: tuple[tuple[str, ...], ...] | None = None
-    """Geoms of each foot, whose forces count together; each of the robot's ``foot_geoms`` by itself if None."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,11 +81,10 @@ class History:
 
 @dataclass(frozen=True, kw_only=True)
 class Wander:
-    """A slow sinusoid of joint targets. Its phase depends on the joint angles in an episode's first step alone."""
+    """A sinusoid of joint targets, whose phase depends on the joint angles in an episode's first step alone."""
 
     joints: tuple[str, ...]
-    amplitude: NonNegativeFloat | tuple[NonNegativeFloat, ...]
-    """Of all joints, or of each [rad]."""
+    amplitude: PositiveFloat  # [rad]
     period_s: PositiveFloat
 
 
@@ -154,7 +141,8 @@ def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
         settings = ("term", "clip", "scale", "history", *TERMS[name])
         if unknown := sorted(item.keys() - settings):
             raise ValueError(f"{label} has no setting {', '.join(unknown)}: there are {', '.join(settings)}")
-        if missing := _REQUIRED.get(name, set()) - item.keys():
+        item = {"order": "sin cos"} | item if name == "clock" else item
+        if missing := {"period_s", "order", "value", "axes"} & {*TERMS[name]} - item.keys():
             raise ValueError(f"{label}: missing '{missing.pop()}'")
         term = from_builtins(Term, item, label)
         if term.order is not None and not re.fullmatch(_ORDERS[name], term.order):
@@ -276,18 +264,13 @@ class Described(torch.nn.Module):
         self._path = path
         self.network: Any = None
         if missing := {*needed_senses(term.axes or term.term for term in cfg.observation)} - {*robot.senses}:
-            senses = to_toml(sorted({*robot.senses, *missing}))
-            self._refuse(
-                f"observation needs the robot's {', '.join(sorted(missing))}: write into robot.toml senses = {senses}"
-            )
+            remedy = f"write into robot.toml senses = {to_toml(sorted({*robot.senses, *missing}))}"
+            self._refuse(f"observation needs the robot's {', '.join(sorted(missing))}: {remedy}")
         self._moved = self._find_joints(cfg.joints)
-        wander = cfg.wander
-        self._wandering = () if wander is None else self._find_joints(wander.joints, "wander.joints")
+        self._wandering = self._find_joints(cfg.wander.joints, "wander.joints") if cfg.wander else ()
         if taken := {*self._moved} & {*self._wandering, *self._find_joints(tuple(cfg.hold or ()), "hold")}:
             names = ", ".join(robot.joint_names[k] for k in sorted(taken))
             self._refuse(f"hold and wander must name joints that the network does not move, got {names}")
-        if wander is not None and isinstance(wander.amplitude, tuple) and len(wander.amplitude) != len(wander.joints):
-            self._refuse(f"wander.amplitude must be one number or {len(wander.joints)}, got {len(wander.amplitude)}")
         self.num_actions = len(self._moved)
         for name in ("default", "action_scale", "action_offset", "action_clip"):
             values = getattr(cfg, name)
@@ -326,19 +309,19 @@ class Described(torch.nn.Module):
             return torch.tensor(np.array(values), dtype=torch.float32, device=device)
 
         robot_pose = self.robot.default_joint_pos
-        robot_scale = self.robot.action_scale
         moved_pose = [robot_pose[k] for k in self._moved]
         default = cfg.default or moved_pose
         pose = dict(enumerate(robot_pose)) | dict(zip(self._moved, default, strict=True))
         columns: list[tuple[Any, ...]] = []  # zero, lower and upper limit, and scale
         for term, indices in zip(cfg.observation, self._columns, strict=True):
-            subtracted = term.offset or 0.0 if term.term == "scan" else 0.0
-            zeros = [pose[k] if term.term == "joint_pos" else subtracted for k in indices]
+            shift = term.offset or 0.0 if term.term == "scan" else 0.0
+            zeros = [pose[k] if term.term == "joint_pos" else shift for k in indices]
             sizes = np.broadcast_to(math.inf if term.limit is None else term.limit, len(indices))
             low, high = np.clip([-sizes, sizes], *_limits(term.clip))
             columns += zip(zeros, low, high, np.broadcast_to(term.scale, len(indices)), strict=True)
         self._index = [torch.tensor(indices, device=device) for indices in self._columns]
-        self._constants = [constant(self._find_constants(term)) for term in cfg.observation]
+        constants = (term.at or term.value or term.offset or 0.0 for term in cfg.observation)
+        self._constants = [constant(np.atleast_1d(values)) for values in constants]
         self._zeros, self._low, self._high, self._scale = constant(columns).T
         self._clip = constant(np.broadcast_to(_limits(cfg.action_clip), (self.num_actions, 2))).T
         self._joints = torch.tensor(self._moved, device=device)
@@ -346,10 +329,8 @@ class Described(torch.nn.Module):
         self._offset = constant(cfg.action_offset or default)
         self._radians = constant(np.broadcast_to(cfg.action_scale, self.num_actions))
         held = dict(zip(self.robot.joint_names, robot_pose, strict=True)) | (cfg.hold or {})
-        self._held = constant(np.subtract([*held.values()], robot_pose) / robot_scale)
+        self._held = constant(np.subtract([*held.values()], robot_pose) / self.robot.action_scale)
         self._wanderers = torch.tensor(self._wandering, dtype=torch.long, device=device)
-        amplitude = 0.0 if cfg.wander is None else cfg.wander.amplitude
-        self._amplitude = constant(np.broadcast_to(amplitude, len(self._wandering)) / robot_scale)
         self._phases = constant(0.618 * np.arange(len(self._wandering)))  # so that joints do not swing together
         self._mixed = constant(100.0 * np.arange(1, 1 + self.robot.num_joints))
 
@@ -374,16 +355,13 @@ class Described(torch.nn.Module):
         """The columns of its quantity that a term takes."""
         if "joints" in TERMS[term.term]:
             return self._moved if term.joints is None else self._find_joints(term.joints)
-        if term.term in ("rpy", "heading"):
-            return [_AXES.index(axis) for axis in (term.axes or "yaw").split()]
-        if term.term == "quat":
-            return ["wxyz".index(name) for name in (term.order or "").split()]
-        if term.term in ("constant", "contacts"):
-            return range(len(self._find_constants(term)))
-        if term.term == "clock":
-            return range(len(self._find_constants(term)) * len((term.order or _CLOCK).split()))
+        if term.term in ("rpy", "heading", "quat"):
+            return [_COLUMNS[name] for name in (term.axes or term.order or "yaw").split()]
         if term.term != "scan":
-            return range(self.num_actions if term.term == "last_action" else 3)
+            sizes = {"last_action": self.num_actions, "contacts": len(self.robot.foot_geoms)}
+            sizes |= {"constant": np.size(term.value)}
+            sizes |= {"clock": np.size(term.offset or 0.0) * len((term.order or "").split())}
+            return range(sizes.get(term.term, 3))
         xs, ys = term.x or self.robot.scan_x, term.y or self.robot.scan_y
         points = [(x, y) for y in ys for x in xs] if term.order == "x fastest" else [(x, y) for x in xs for y in ys]
         scan_points = zip(*self.robot.scan_points(), strict=True)
@@ -396,20 +374,6 @@ class Described(torch.nn.Module):
             remedy = f"write into robot.toml scan_x = {x} and scan_y = {y}"
             self._refuse(f"the scan's points are not those of the robot: {remedy}")
         return [index_by_point[point] for point in points]
-
-    def _find_constants(self, term: Term) -> Any:
-        """Numbers that a term's quantity is computed from."""
-        if term.term == "clock":
-            return 2.0 * math.pi * np.atleast_1d(term.offset or 0.0)
-        if term.term == "constant":
-            return np.atleast_1d(term.value)
-        if term.term != "contacts":
-            return term.at or (0.0, 0.0, 0.0)
-        geoms = self.robot.foot_geoms
-        feet = term.feet or tuple((name,) for name in geoms)
-        if unknown := sorted({name for foot in feet for name in foot} - {*geoms}):
-            self._refuse(f"feet must be geoms of the robot's foot_geoms, {', '.join(geoms)}, got {', '.join(unknown)}")
-        return [[name in foot for name in geoms] for foot in feet]
 
     @property
     def graph_safe(self) -> bool:
@@ -450,15 +414,13 @@ class Described(torch.nn.Module):
             if term.term == "lin_vel":
                 quantity = sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, constants.expand_as(sensed.ang_vel))
             elif term.term == "clock":
-                angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf)) + constants
-                waves = {"sin": torch.sin, "cos": torch.cos}
-                quantity = torch.cat([waves[name](angle) for name in (term.order or _CLOCK).split()], dim=1)
+                angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
+                angle = angle + 2.0 * math.pi * constants
+                quantity = torch.cat([getattr(angle, wave)() for wave in (term.order or "").split()], dim=1)
             elif term.term == "constant":
                 quantity = constants.expand(len(row), -1)
-            elif term.term == "contacts":
-                quantity = (sensed.contacts[:, None] * constants).sum(dim=2)
-                if term.threshold is not None:
-                    quantity = (quantity > term.threshold).float()
+            elif term.threshold is not None:
+                quantity = (sensed.contacts > term.threshold).float()
             elif term.term in ("rpy", "heading"):
                 quantity = _euler_angles(sensed)
             else:
@@ -483,9 +445,9 @@ class Described(torch.nn.Module):
         memory = self._get_memory(len(output))
         memory.action.copy_(output.clamp(*self._clip))
         actions = self._held.repeat(len(output), 1)
-        if self.cfg.wander is not None:
-            periods = memory.steps * (self.robot.control_dt / self.cfg.wander.period_s) + memory.phase + self._phases
-            actions[:, self._wanderers] += self._amplitude * torch.sin(2.0 * math.pi * periods)
+        if (wander := self.cfg.wander) is not None:
+            periods = memory.steps * (self.robot.control_dt / wander.period_s) + memory.phase + self._phases
+            actions[:, self._wanderers] += wander.amplitude / self.robot.action_scale * torch.sin(2 * math.pi * periods)
         memory.steps.add_(1.0)
         queue = torch.cat([memory.action[:, None], memory.sent], dim=1)
         memory.sent.copy_(queue[:, :-1])

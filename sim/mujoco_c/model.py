@@ -275,11 +275,7 @@ def observations(
 
 
 def sense_columns(senses: Sequence[str], qpos: Array, forces: Array, torques: Array) -> Array:
-    """Columns after the scan, shape (num, sum of ``robot.sense_sizes``).
-
-    States have shape (num, 7 + num_joints), forces on the feet, world frame [N], (num, num_feet, 3), torques of the
-    joints [N m] (num, num_joints).
-    """
+    """Columns after the scan, of states, forces on the feet [N] (num, num_feet, 3) and torques of the joints [N m]."""
     columns = {"pose": qpos[:, :7], "contacts": 0.01 * np.linalg.norm(forces, axis=2), "torques": 0.01 * torques}
     return np.concatenate([qpos[:, :0], *(columns[name] for name in columns if name in senses)], axis=1)
 

@@ -152,11 +152,10 @@ class RobotCfg:
         return len(self.scan_x) * len(self.scan_y)
 
     @property
-    def sense_sizes(self) -> tuple[int, int, int]:
+    def sense_sizes(self) -> tuple[int, ...]:
         """Columns of the base's pose, of the contacts of the feet and of torques, in the observation row's order."""
         sizes = {"pose": 7, "contacts": len(self.foot_geoms), "torques": self.num_joints}
-        pose, contacts, torques = (size * (name in self.senses) for name, size in sizes.items())
-        return pose, contacts, torques
+        return tuple(size * (name in self.senses) for name, size in sizes.items())
 
     @property
     def observation_size(self) -> int:

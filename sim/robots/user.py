@@ -160,7 +160,7 @@ def describe_inferred(robot: RobotCfg) -> str:
     if file is None or file.suffix != ".toml":
         return ""
     required = [field.name for field in fields(RobotCfg) if field.default is field.default_factory is MISSING]
-    optional = ["default_base_height", *["senses"] * bool(robot.senses)]
+    optional = ("default_base_height", *["senses"][: len(robot.senses)])
     names = [name for name in (*required, *optional) if name not in read_toml(file)]
     lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in names]
     return "\n  ".join([f"Inferred; what is not right can be set in {file}:", *lines])
