@@ -19,15 +19,17 @@ from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_
 from sim.robots.robot import RobotCfg, needed_senses
 
 TERMS: dict[str, tuple[str, ...]] = {
-    "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit",), "joint_pos": ("joints",),
+    "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit", "order"), "joint_pos": ("joints",),
     "joint_vel": ("joints",), "last_action": (), "clock": ("period_s", "order", "offset"),
     "constant": ("value",), "rpy": ("axes",), "heading": (), "quat": ("order",), "base_pos": (),
     "contacts": ("threshold",), "torques": ("joints",), "scan": ("order", "x", "y", "offset"),
 }  # fmt: skip
 """Fields of each term besides those of all terms; docs/controllers.md explains them."""
 _ORDERS = {"scan": "(x|y) fastest", "clock": "(sin|cos)( (sin|cos))?", "quat": "w x y z|x y z w"}
-_COLUMNS = {"roll": 0, "pitch": 1, "yaw": 2, "w": 0, "x": 1, "y": 2, "z": 3}
-"""Columns of axes in the base's angles, and in a quaternion."""
+_ORDERS["command"] = "(v_x|v_y|yaw_rate)( (v_x|v_y|yaw_rate))*"
+_USUAL_ORDERS = {"clock": "sin cos", "command": "v_x v_y yaw_rate"}
+_COLUMNS = {"roll": 0, "pitch": 1, "yaw": 2, "w": 0, "x": 1, "y": 2, "z": 3, "v_x": 0, "v_y": 1, "yaw_rate": 2}
+"""Columns of axes in the base's angles, in a quaternion, and in a command."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +53,8 @@ class Term:
     period_s: PositiveFloat | None = None
     """Period of a clock [s]."""
     order: str | None = None
-    """Of a scan's points "x fastest" or "y fastest", of a quaternion "w x y z" or "x y z w", of a clock "sin cos"."""
+    """Of a scan's points "x fastest" or "y fastest", of a quaternion "w x y z" or "x y z w", of a clock "sin cos",
+    of a command "v_x v_y yaw_rate"."""
     x: tuple[float, ...] | None = None
     """Points of a scan ahead of the base, yaw frame [m]; the robot's ``scan_x`` if None."""
     y: tuple[float, ...] | None = None
@@ -141,7 +144,7 @@ def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
         settings = ("term", "clip", "scale", "history", *TERMS[name])
         if unknown := sorted(item.keys() - settings):
             raise ValueError(f"{label} has no setting {', '.join(unknown)}: there are {', '.join(settings)}")
-        item = {"order": "sin cos"} | item if name == "clock" else item
+        item = {"order": _USUAL_ORDERS[name]} | item if name in _USUAL_ORDERS else item
         if missing := {"period_s", "order", "value", "axes"} & {*TERMS[name]} - item.keys():
             raise ValueError(f"{label}: missing '{missing.pop()}'")
         term = from_builtins(Term, item, label)
@@ -316,7 +319,8 @@ class Described(torch.nn.Module):
         for term, indices in zip(cfg.observation, self._columns, strict=True):
             shift = term.offset or 0.0 if term.term == "scan" else 0.0
             zeros = [pose[k] if term.term == "joint_pos" else shift for k in indices]
-            sizes = np.broadcast_to(math.inf if term.limit is None else term.limit, len(indices))
+            limits = np.broadcast_to(math.inf if term.limit is None else term.limit, 3)
+            sizes = limits[[k % 3 for k in indices]]  # only those of a command differ
             low, high = np.clip([-sizes, sizes], *_limits(term.clip))
             columns += zip(zeros, low, high, np.broadcast_to(term.scale, len(indices)), strict=True)
         self._index = [torch.tensor(indices, device=device) for indices in self._columns]
@@ -355,8 +359,8 @@ class Described(torch.nn.Module):
         """The columns of its quantity that a term takes."""
         if "joints" in TERMS[term.term]:
             return self._moved if term.joints is None else self._find_joints(term.joints)
-        if term.term in ("rpy", "heading", "quat"):
-            return [_COLUMNS[name] for name in (term.axes or term.order or "yaw").split()]
+        if term.term in ("rpy", "heading", "quat", "command"):
+            return [_COLUMNS[name] for name in (term.axes or term.order or _USUAL_ORDERS.get(term.term, "yaw")).split()]
         if term.term != "scan":
             sizes = {"last_action": self.num_actions, "contacts": len(self.robot.foot_geoms)}
             sizes |= {"constant": np.size(term.value)}

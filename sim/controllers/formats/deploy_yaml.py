@@ -114,5 +114,6 @@ def _read_observations(
             selected = _select_joints((params.get("asset_cfg") or {}).get("joint_ids"), joints)
             row |= {"joints": selected} if selected != moved else {}
         rows.append(row)
-    source.set_history(rows, [item.get("history_length") or 1 for item in terms.values()], "row" if by_row else "term")
+    lengths = [item.get("history_length") or 1 for item in terms.values()]
+    source.set_history(rows, lengths, by="row" if by_row else "term")
     source.set(observation=rows)

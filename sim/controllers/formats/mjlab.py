@@ -1,23 +1,15 @@
 """A controller of mjlab: an ONNX file with its metadata."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 
 from sim.controllers.formats.network import load_network
+from sim.controllers.formats.onnx_data import read_metadata
 from sim.controllers.formats.source import SETTINGS, TERM_NAMES, Source, make_term
 
 _MJLAB_KEYS = ("default_joint_pos", "joint_stiffness", "joint_damping", "action_scale")
-
-
-def _read_metadata(file: Path) -> Mapping[str, str]:
-    try:
-        return {item.key: item.value for item in onnx.ModelProto.FromString(file.read_bytes()).metadata_props}
-    except Exception as error:  # protobuf's errors have no base
-        raise ValueError(f"{file} is no ONNX file: {error}") from None
 
 
 class Mjlab:
@@ -27,12 +19,12 @@ class Mjlab:
 
     def matches(self, path: Path) -> bool:
         """Whether it is an ONNX file that names its observations."""
-        return path.suffix == ".onnx" and path.is_file() and "observation_names" in _read_metadata(path)
+        return path.suffix == ".onnx" and path.is_file() and "observation_names" in read_metadata(path)
 
     def read(self, path: Path, source: Source) -> Path:
         """Settings of the metadata; the file is also that of the weights."""
         load_network(path, "cpu", None, label="it")  # refuses a damaged file
-        content: dict[str, Any] = {key: text.split(",") for key, text in _read_metadata(path).items() if text}
+        content: dict[str, Any] = {key: text.split(",") for key, text in read_metadata(path).items() if text}
         names = content.pop("observation_names")
         joints = content.pop("joint_names")
         source.refuse_unknown(names, TERM_NAMES)

@@ -39,6 +39,11 @@ def read_onnx(path: Path) -> tuple[Any, bytes]:
     return model, model.SerializeToString()
 
 
+def read_metadata(path: Path) -> dict[str, str]:
+    """What an exporter wrote into an ONNX file beside its graph, by names."""
+    return {item.key: item.value for item in _read_graph(path)[0].metadata_props}
+
+
 def _read_graph(path: Path) -> tuple[Any, list[Any]]:
     """The graph of a file, and its tensors whose values are in another."""
     try:

@@ -95,12 +95,12 @@ class Source:
         if tuple(joints) != self.joints:
             self.set(joints=list(joints), reason=reason)
 
-    def set_history(self, terms: list[dict[str, Any]], lengths: Sequence[int], by: str = "term") -> None:
+    def set_history(self, terms: list[dict[str, Any]], lengths: Sequence[int], **layout: str) -> None:
         """Stores former steps as Isaac Lab and mjlab lay them out; lengths that differ are written into the terms."""
         for term, length in zip(terms, lengths, strict=True):
             term |= {"history": length} if len(set(lengths)) > 1 else {}
         if max(lengths) > 1:
-            self.set(history={"length": max(lengths), "newest": "last", "by": by, "fill": "first"})
+            self.set(history={"length": max(lengths), "newest": "last", "by": "term", "fill": "first", **layout})
 
     def read_ranges(self, ranges: Mapping[str, Any]) -> list[float]:
         """Largest size of each command, of its ranges; a robot that is slower than usual is given its speed."""

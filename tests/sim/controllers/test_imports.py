@@ -105,6 +105,22 @@ observations:
   joint_vel_rel: {params: {asset_cfg: {joint_ids: [0, 4]}}, clip: null, scale: [1, 1], history_length: 3}
   gait_phase: {params: {period: 0.6}, clip: null, scale: [1, 1], history_length: 3}
 """
+HOLOSOMA = {
+    "dof_names": [*JOINTS], "kp": [40.0] * 8, "kd": [2.0] * 8, "iteration": 9,
+    "command_ranges": {"lin_vel_x": [-1, 1], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-0.5, 0.5]},
+    "experiment_config": {
+        "robot": {
+            "init_state": {"default_joint_angles": dict(zip(JOINTS, [0.6, -1.2] * 4, strict=True))},
+            "control": {"action_scale": 0.3, "action_clip_value": 50.0}, "dof_armature_list": [0.02] * 8,
+        },
+        "simulator": {"config": {"sim": {"fps": 500, "control_decimation": 10}}},
+        "command": {"setup_terms": {"locomotion_gait": {"params": {"gait_period": 0.9}}}},
+        "observation": {"groups": {"actor_obs": {"history_length": 2, "terms": {
+            "sin_phase": {}, "projected_gravity": {}, "dof_vel": {"scale": 0.1}, "dof_pos": {}, "cos_phase": {},
+            "command_lin_vel": {}, "command_ang_vel": {"scale": 0.5}, "base_ang_vel": {}, "actions": {},
+        }}}},
+    },
+}  # fmt: skip
 
 
 def write(file, content):
@@ -145,6 +161,14 @@ def mjlab(folder, **changes):
     return folder / "run.onnx"
 
 
+def holosoma(folder, width=2 * 37, **changes):
+    model = linear(width, 8, batch=1)
+    content = {name: json.dumps(value) for name, value in (HOLOSOMA | changes).items() if value is not None}
+    onnx.helper.set_model_props(model, content)
+    onnx.save(model, folder / "loco.onnx")
+    return folder / "loco.onnx"
+
+
 def isaac_lab(folder, old="", new=""):
     assert old in ISAAC
     write(folder / "params" / "env.yaml", ISAAC.replace(old, new))
@@ -164,11 +188,11 @@ def deploy(folder, *changes):
     return folder
 
 
-def imported(source, tmp_path):
+def imported(source, tmp_path, old="", new=""):
     """The robot and the description that are written of a source, as they load."""
     model = tmp_path / "model" / "dog.xml"
     model.parent.mkdir(exist_ok=True)
-    text = mjcf(drive='<motor joint="{0}"/>')
+    text = mjcf(drive='<motor joint="{0}"/>').replace(old or "?", new)
     model.write_text(text.replace("<freejoint", '<site name="imu" pos="0.1 0 0"/><freejoint', 1))
     out = tmp_path / "mine" / "dog"
     import_controller(source, model, out)
@@ -269,6 +293,26 @@ def test_a_deploy_yaml_may_have_mjlabs_order_missing_motors_and_whole_rows(tmp_p
     assert controller.joints == JOINTS and robot.stiffness == (22, 23, 20, 21, 26, 27, 24, 25)
     assert controller.action_offset == (0.4, -1.1, 0.6, -1.2, 0.5, -1.1, 0.6, -1.2)
     assert controller.history.by == "row"
+
+
+def test_holosoma_sorts_terms_by_name_and_has_a_phase_of_each_foot(tmp_path):
+    robot, controller = imported(holosoma(tmp_path), tmp_path, ' armature="0.01"')
+    assert (robot.stiffness, robot.armature, robot.default_joint_pos) == ((40.0,) * 8, (0.02,) * 8, (0.6, -1.2) * 4)
+    assert (robot.physics_dt, robot.decimation) == (0.002, 10)
+    assert (controller.action_scale, controller.action_clip, controller.history.fill) == (0.3, 50.0, "zeros")
+    action, _, turn, walk, cosine, _, joint_vel, _, sine = controller.observation
+    assert (action.term, turn.order, turn.scale, walk.order) == ("last_action", "yaw_rate", 0.5, "v_x v_y")
+    assert (cosine.order, cosine.offset, cosine.period_s, sine.order) == ("cos", (0.0, 0.5), 0.9, "sin")
+    assert (joint_vel.scale, walk.limit) == (0.1, (1.0, 0.4, 0.5))
+
+
+def test_holosomas_humanoids_have_its_usual_configuration(tmp_path):
+    names = ["left_hip_pitch_joint", *JOINTS[1:]]
+    source = holosoma(tmp_path, 37, dof_names=names, experiment_config=None)
+    with pytest.raises(ValueError, match="default_joint_pos is outside of the file's range for FL_knee"):
+        imported(source, tmp_path, "FL_hip", "left_hip_pitch_joint")  # 0 rad, as joints that only a dog has
+    text = (tmp_path / "mine" / "dog" / "robot.toml").read_text()
+    assert "default_joint_pos = [-0.312, 0.0" in text and "no experiment_config" in text
 
 
 def test_a_run_of_isaac_lab_is_read(tmp_path):
@@ -378,6 +422,8 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (lambda folder: deploy(folder, ("clip: null, joint", "clip: [[-1, 1]], joint")), {}, "actions.clip"),
         (lambda folder: deploy(folder, (", 7, 5]", ", 7]")), {}, "joint_ids_map"),
         (lambda folder: deploy(folder, ("step_dt:", "gear: 1\nstep_dt:")), {}, "gear"),
+        (holosoma, {"experiment_config": None}, "it must see 37 columns"),
+        (holosoma, {"experiment_config": None, "width": 37}, "neither G1 nor T1"),
         (lambda folder: folder, {}, "a run of Isaac Lab (a folder with params/env.yaml), or a deployment of"),
     ],
 )
