@@ -19,6 +19,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from shutil import get_terminal_size
 from types import FrameType
@@ -128,6 +129,8 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
+        if int(version("mujoco").partition(".")[0]) > 3:
+            raise UserError(f"mujoco must be of version 3, as Newton needs it, got {version('mujoco')}: `make setup`")
         command = _parse(cls, argv, name)
         check_settings(command)
         status = command.execute()

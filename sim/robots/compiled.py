@@ -42,6 +42,16 @@ _ZERO_ATTRIBUTES = {
     "actuator": ("armature", "damping", "delay"),
 }
 """Attributes of elements that must be 0."""
+_NEWTON_SOLVERS = {
+    "<equality> connect": "SolverKamino, closed loops",
+    "<equality> weld": "SolverKamino, closed loops",
+    "only joint of its body": "SolverMuJoCo, D6 joints",
+    "a ball joint": "SolverMuJoCo, ball joints",
+    "a tendon": "SolverMuJoCo, tendons",
+    "a <velocity> drive": "SolverMuJoCo, targets of velocity",
+    "a flexible body": "SolverVBD, soft bodies",
+}
+"""What of Newton's solvers can do what is refused, by their own documentation."""
 
 
 def joint_names(model: Any) -> tuple[str, ...]:
@@ -247,7 +257,9 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
     if len(home) not in (0, model.nq):
         problems.append(f"qpos of the keyframe home must be {model.nq} numbers, got {len(home)}")
     if problems:
-        raise ValueError("; ".join(f"{model_file}: {_quote_urdf(problem, files)}" for problem in problems))
+        text = "; ".join(f"{model_file}: {_quote_urdf(problem, files)}" for problem in problems)
+        solvers = dict.fromkeys(solver for part, solver in _NEWTON_SOLVERS.items() if part in text)
+        raise ValueError(f"{text} (Newton could, but not here: {'; '.join(solvers)})" if solvers else text)
     return RobotFile(spec=spec, model=model, home=home[7:] or None, is_urdf=files.is_urdf)
 
 

@@ -55,7 +55,7 @@ def find_above(name: str, folder: Path) -> Path | None:
     What stands for a folder is left out: ``{LEGGED_GYM_ROOT_DIR}/``, ``package://``, a package's name. A name without a
     folder is looked for in ``folder`` alone.
     """
-    path = Path(re.sub(r"^(\{\w+\}/|package://|file://)", "", name))
+    path = Path(re.sub(r"^(\{\w+\}/|package://)", "", name))
     paths = [path, Path(*path.parts[1:])] if name.startswith(_PACKAGE) else [path]
     folders = [folder, *folder.resolve().parents][: None if len(path.parts) > 1 else 1]
     return next((file for path in paths for parent in folders if (file := parent / path).is_file()), None)
@@ -146,16 +146,14 @@ def _can_be_shown(visual: ET.Element, model_file: Path) -> bool:
 def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
     """Path of a URDF's mesh, whether or not it exists."""
     name = mesh.get("filename", "").removeprefix("file://")
-    path = model_file.parent / name
-    if name.startswith(_PACKAGE):
-        path = find_above(name, model_file.parent)
-        if path is None:
-            package = name.removeprefix(_PACKAGE).partition("/")[0]
-            remedy = "put the URDF into its package, or write the mesh's path relative to the URDF"
-            raise ValueError(f"{model_file}: mesh {name} is not in package {package} of a folder above: {remedy}")
-    elif "://" in name:
+    path = find_above(name, model_file.parent)
+    if path is None and name.startswith(_PACKAGE):
+        package = name.removeprefix(_PACKAGE).partition("/")[0]
+        remedy = "put the URDF into its package, or write the mesh's path relative to the URDF"
+        raise ValueError(f"{model_file}: mesh {name} is not in package {package} of a folder above: {remedy}")
+    if path is None and "://" in name:
         raise ValueError(f"{model_file}: mesh {name} must be a file here: nothing is downloaded")
-    return Path(os.path.abspath(path))
+    return Path(os.path.abspath(path or model_file.parent / name))
 
 
 def _mjcf_files(model_file: Path) -> list[Path]:
