@@ -12,14 +12,7 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.dose import measure_dose, parse_doses
-from qd.evaluate.level import (
-    MIN_GOAL_RATE,
-    describe_level_ground,
-    give_time,
-    is_measured,
-    measure_level_ground,
-    refuse_unless_walks,
-)
+from qd.evaluate.level import MIN_GOAL_RATE, give_time, measure_level_ground, report_level_ground
 from qd.search.directory import RUNS
 from qd.why import explain_walk
 from qd.workers.compute import Compute, check_policy
@@ -100,27 +93,16 @@ def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute, *, skip_
     if robot.settings_file is None:
         return robot
     policy = policy or str(robot.policy_file)
-    has_scales = True
     try:
         read_penalty_scales(robot)
     except ValueError:
-        has_scales = False
         check_policy(policy, robot, compute.device)
-        robot = prepare_level_ground(robot, policy, compute)
-    if not skip_level_ground:
-        refuse_unless_walks(robot, policy, compute)
-    if not has_scales:
+        robot = give_time(_stand_with_room(robot, compute.device, 1.0).robot, policy, compute)
+        report_level_ground(robot, policy, compute, must_walk=not skip_level_ground)
         print(f"There are no penalty scales of robot '{robot.name}' as it is: they are measured first.", flush=True)
         calibrate(robot, policy, compute=compute, terrains=4_000 if compute.on_gpu else 400, replicas=1)
-    return robot
-
-
-def prepare_level_ground(robot: RobotCfg, policy: str, compute: Compute) -> RobotCfg:
-    """A user's robot with room for contacts and time for a crossing, both measured and written if they are not yet."""
-    if is_measured(robot, policy):
-        return robot
-    robot = give_time(_stand_with_room(robot, compute.device, 1.0).robot, policy, compute)
-    print(f"On level ground {describe_level_ground(robot, policy, compute)}.", flush=True)
+    else:
+        report_level_ground(robot, policy, compute, must_walk=not skip_level_ground)
     return robot
 
 

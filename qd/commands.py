@@ -15,7 +15,6 @@ from sim.controllers.spec import parse_controllers
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt, select_settings
 from sim.robots.find import get_robot, resolve_robot
-from sim.robots.robot import RobotCfg
 
 _METHOD_HELP = (
     f"Where new terrains come from: {'; '.join(f'{name}, {method.text}' for name, method in METHODS.items())}. Several "
@@ -29,14 +28,6 @@ def _compute(flags: WorkerFlags) -> Any:
     from qd.workers.compute import Compute
 
     return Compute.resolve(flags.device, flags.workers, flags.num_envs)
-
-
-def _warn_unless_walks(robot: RobotCfg, policy: str, compute: Any) -> None:
-    """Says so if a user's robot does not cross level ground under a controller: its rates say nothing of terrains."""
-    from qd.evaluate.level import describe_failure
-
-    if failure := describe_failure(robot, policy, compute):
-        print(f"{policy} does not walk on level ground: {failure}.", flush=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +183,7 @@ class JudgeCommand(_RunFlags):
 
     def execute(self) -> None:
         """Judges the run."""
-        from qd.evaluate.level import refuse_unless_walks
+        from qd.evaluate.level import report_level_ground
         from qd.faults.judge import judge
         from qd.faults.searches import find_search
         from qd.search.results import print_summary
@@ -200,7 +191,7 @@ class JudgeCommand(_RunFlags):
         run, named = self.named()
         if not self.skip_level_ground:
             searched = find_search(run, robot=self.robot, policy=self.policy, space=self.space)
-            refuse_unless_walks(searched.robot, searched.policy, named["compute"])
+            report_level_ground(searched.robot, searched.policy, named["compute"], must_walk=True)
         archive = judge(run, stages=self.stages, **named)
         print_summary(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 
@@ -256,11 +247,11 @@ class ImportCommand:
         from sim.controllers.imports import import_controller
 
         if import_controller(self.source, self.model, self.out):
-            from qd.check import prepare_level_ground
+            from qd.evaluate.level import give_time, report_level_ground
             from qd.workers.compute import Compute
 
-            robot = get_robot(str(self.out / "robot.toml"))
-            prepare_level_ground(robot, str(robot.policy_file), Compute.resolve())
+            robot, compute = get_robot(str(self.out / "robot.toml")), Compute.resolve()
+            report_level_ground(give_time(robot, str(robot.policy_file), compute), None, compute)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -337,7 +328,6 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
             pack = read_pack(find_pack(self.pack))
             robot = resolve_robot(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
             policy = self.policy or str(robot.policy_file)
-            _warn_unless_walks(robot, policy, _compute(self))
             report = evaluate_pack(pack, robot, policy, compute=_compute(self), out=self.out, **size)
             return int(self.fail_under is not None and not passes(report, self.fail_under))
         if self.fail_under is not None:
@@ -345,7 +335,6 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         robot, compute = get_robot(self.robot), _compute(self)
         if not makes_tables:
             policy = self.policy or str(robot.policy_file)
-            _warn_unless_walks(robot, policy, compute)
             evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
             return 0
         if self.policy is not None:
@@ -354,8 +343,6 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
             )
         controllers = parse_controllers(self.policies, robot)
         robot = ensure_ready(robot, next(iter(controllers.values())), compute, skip_level_ground=True)
-        for policy in controllers.values():
-            _warn_unless_walks(robot, policy, compute)
         cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
 

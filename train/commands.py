@@ -97,8 +97,6 @@ class HardenCommand(HardenCfg, WorkerFlags):
     """Which robot: anymal, cassie, or the file of another (mine/go2/robot.toml); its settings are the defaults."""
     run_dir: Path | None = None
     """Where to work, and to go on; runs/<robot>-harden-<seed>."""
-    skip_level_ground: bool = False
-    """Harden though the controller of a robot of yours does not cross level ground."""
 
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> Self:
@@ -108,14 +106,11 @@ class HardenCommand(HardenCfg, WorkerFlags):
 
     def execute(self) -> None:
         """Hardens."""
-        from qd.evaluate.level import refuse_unless_walks
         from qd.workers.compute import Compute
         from train.harden import harden
 
         robot, compute = get_robot(self.robot), Compute.resolve(self.device, self.workers, self.num_envs)
         run_dir = self.run_dir or Path("runs") / f"{robot.name}-harden-{self.seed}"
-        if not self.skip_level_ground:
-            refuse_unless_walks(robot, self.policy or str(robot.policy_file), compute)
         harden(robot, select_settings(HardenCfg, self), run_dir, compute)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.evaluate import cross_sets, evaluate, fill_sizes
+from qd.evaluate.level import report_level_ground
 from qd.evaluate.measures import terrain_rates
 from qd.evaluate.sets import MIN_ELITES, Purpose, TerrainSet, generated_set, make_sets, paper_terrains
 from qd.evaluate.tables import show_table
@@ -95,6 +96,7 @@ class _Hardening:
         base = cfg.policy or str(robot.policy_file)
         read_start(Path(base), robot)
         check_policy(base, robot, compute.device)
+        report_level_ground(robot, base, compute, must_walk=True)
         tune = cfg.sized_tune(robot, compute.device)
         tune.check(robot)
         full = (paper_terrains(robot.name), EPISODES)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.labels import COMPARED, HELD_OUT, MEASURES, RATES, SETS, SetsCfg
+from qd.evaluate.level import report_level_ground
 from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise_crossings, terrain_rates, velocity_error
 from qd.evaluate.sets import (
     TerrainSet,
@@ -74,6 +75,8 @@ def cross_sets(
     """
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     largest = max(map(len, sets.values()))
+    for policy in controllers.values():
+        report_level_ground(robot, policy, compute)
     with Crosser(robot, compute, cache=cache) as crosser:
         crossings = [*product(controllers.items(), sets.items())]
         for number, ((controller, policy), (name, terrains)) in enumerate(crossings, 1):

@@ -92,8 +92,7 @@ class EliteFlags(SpaceFlag):
     --elite has them; all are those that have one."""
 
 
-BEGAN = time.monotonic()
-"""When the program began [s]."""
+BEGAN = time.monotonic()  # when the program began [s]
 
 
 class UserError(Exception):
