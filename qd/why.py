@@ -22,7 +22,8 @@ from sim.robots.robot import RobotCfg
 from sim.trials import MEASURES, Variant, walk_variants
 
 _FIRST_S, _SECOND_S = 3.6, 4.5  # time that robots walk in the two rounds [s]
-_KEPT, _REPLICAS = 16, 4  # changes in the second round, and episodes of each
+_KEPT = 16  # changes in the second round
+_EPISODES = {"cuda": (4, 16), "cpu": (1, 4)}  # of each change in the two rounds
 _LEAST_GAIN = 0.03  # of the score for which a change is named
 _WEIGHTS = {"roll_pitch_rate": 0.2, "tilt": 2.0, "action_rate": 0.4, "action": 0.05, "power": 0.4}
 """Chosen on errors planted into Go2 (robot_lab), B2, Go1 and ANYmal, on no other robot."""
@@ -165,13 +166,14 @@ def rank_changes(base: Variant, weights: Path, *, device: str) -> list[Change]:
     base = replace(base, controller=write_out(base.controller, base.robot))
     changes = [Change("nothing", base), *propose_changes(base)]
     variants = [change.variant for change in changes]
-    walks = walk_variants(variants, weights, device=device, seconds=_FIRST_S, replicas=1)
+    once, again = _EPISODES["cuda" if device.startswith("cuda") else "cpu"]
+    walks = walk_variants(variants, weights, device=device, seconds=_FIRST_S, replicas=once)
     scores = [
         float(np.mean(score_walks(walk, change.variant.robot))) for walk, change in zip(walks, changes, strict=True)
     ]
     best = sorted({0, *np.argsort(-np.array(scores), kind="stable")[:_KEPT].tolist()})
     variants = [variants[k] for k in best]
-    walks = walk_variants(variants, weights, device=device, seconds=_SECOND_S, replicas=_REPLICAS, seed=1)
+    walks = walk_variants(variants, weights, device=device, seconds=_SECOND_S, replicas=again, seed=1)
     ranked = []
     for k, walk in zip(best, walks, strict=True):
         score = float(np.mean(score_walks(walk, changes[k].variant.robot)))

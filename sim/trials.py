@@ -115,11 +115,10 @@ def _walk_alike(
     count = len(delays)
     sim = Simulation(robot, TerrainBank(1, device=device), np.zeros(count, dtype=int))
     _vary_drives(sim, np.repeat([variants[k].gains for k in order], replicas, axis=0), delays)
-    torch_device = torch.device("cuda" if device.startswith("cuda") else "cpu")
     blocks = [Described(cfg, robot, str(weights)) for cfg in descriptions]
-    loaded = load_described(descriptions[0], weights, robot, str(torch_device), weights.with_name("controller.toml"))
+    loaded = load_described(descriptions[0], weights, robot, device, weights.with_name("controller.toml"))
     for block in blocks:
-        block.use(None, torch_device)
+        block.use(None, torch.device(device))
     policy = _SideBySide(blocks, (replicas * np.bincount(block_numbers)).tolist(), loaded.network)
     cfg, task = CrossingCfg(), make_task(CrossingCfg(), robot)
     with wp.ScopedDevice(device):

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from qd.why import Change, describe_ranked, propose_changes, rank_changes, write_out
+from results.make.common import read_alike
 from sim.controllers.described import read_controller
 from sim.controllers.spec import controller_identity, weights_file
 from sim.device import resolve_device
-from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.atomic import to_json, write_atomically
 from sim.files.provenance import provenance
 from sim.robots.find import get_robot
 from sim.trials import MEASURES, Variant, walk_variants
@@ -35,40 +36,39 @@ ERRORS = {
     "command scale": r"command x (0\.5|2\.0)$",
     "time step": r"decimation$",
 }
-"""Ten kinds by the changes of :func:`qd.why.propose_changes` that are of the kind."""
-SPARES = (r"(joint_vel|joint_pos|last_action) x (0\.25|4\.0)$", r"order of (lin_vel|ang_vel|gravity) and", r"damping x")
-"""Kinds in place of those that a controller does not have, or that change nothing."""
+SPARES = {
+    "scale of a term": r"(joint_vel|joint_pos|last_action) x (0\.25|4\.0)$",
+    "order of terms": r"order of (lin_vel|ang_vel|gravity) and",
+    "velocity gain": r"damping x",
+}
+"""Ten kinds, by the changes of :func:`qd.why.propose_changes`, and those in place of what there is not."""
 LEAST_CHANGE = 0.03
-
-
-def walk_speed(variant: Variant, weights: Path, device: str) -> float:
-    """Mean speed over the time, 0 where the robot falls [m/s]."""
-    (walks,) = walk_variants([variant], weights, device=device, seconds=6.0, replicas=8, seed=2)
-    alive, speed = (np.nan_to_num(walks[:, MEASURES.index(name)]) for name in ("alive", "speed"))
-    return float(np.mean(np.where(alive == 1.0, speed, 0.0)))
 
 
 def plant_errors(
     base: Variant, weights: Path, device: str, seed: int
 ) -> Iterator[tuple[str, Change, float, list[str]]]:
-    """Kind, error, speed with it [m/s], and the errors that it stands for since they change too little."""
+    """Kind, error, speed with it [m/s], and errors in whose place it stands; the base's description is written out."""
     changes, rng = propose_changes(base), np.random.default_rng(seed)
-    speed, spares = walk_speed(base, weights, device), iter(SPARES)
-    for kind, pattern in ERRORS.items():
-        replaced: list[str] = []
-        while True:
-            options = [change for change in changes if re.match(pattern, change.text)]
-            for number in rng.permutation(len(options))[:4]:
-                other = walk_speed(options[number].variant, weights, device)
-                if abs(other - speed) >= LEAST_CHANGE * speed:
-                    yield kind, options[number], other, replaced
-                    break
-                replaced.append(f"{options[number].text}: {other:.3f} m/s of {speed:.3f}")
-            else:
-                replaced += [] if options else ["it has none"]
-                pattern = next(spares)
-                continue
-            break
+    drawn: list[tuple[str, Change]] = []
+    for kind, pattern in (ERRORS | SPARES).items():
+        matching = [change for change in changes if re.match(pattern, change.text)]
+        drawn += [(kind, matching[k]) for k in rng.permutation(len(matching))[:4]]
+    variants = [base, *(change.variant for _, change in drawn)]
+    walks = np.nan_to_num(walk_variants(variants, weights, device=device, seconds=6.0, replicas=8, seed=2))
+    alive, speed = (walks[..., MEASURES.index(name)] for name in ("alive", "speed"))
+    walked, *speeds = np.where(alive == 1.0, speed, 0.0).mean(axis=1).tolist()
+    errors = [(kind, change, other) for (kind, change), other in zip(drawn, speeds, strict=True)]
+    for kind in ERRORS:
+        replaced = [] if kind in dict(drawn) else ["it has none"]
+        for error in [error for error in errors if error[0] == kind] + [
+            error for error in errors if error[0] in SPARES
+        ]:
+            if abs(error[2] - walked) >= LEAST_CHANGE * walked:
+                errors.remove(error)
+                yield *error, replaced
+                break
+            replaced.append(f"{error[1].text}: {error[2]:.3f} m/s of {walked:.3f}")
 
 
 def measure(file: Path, device: str, seed: int) -> dict[str, Any]:
@@ -99,12 +99,14 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--out", type=Path, default=Path("results/planted.json"))
     args = parser.parse_args(argv)
     device = resolve_device(args.device)
-    prepare_output(args.out)
-    content = provenance(device, args.seed)
-    content["controllers"] = {file.parent.name: measure(file, device, args.seed) for file in args.robots}
-    content["named"] = sum(numbers["named"] for numbers in content["controllers"].values())
-    content["planted"] = sum(len(numbers["errors"]) for numbers in content["controllers"].values())
-    write_atomically(args.out, to_json(content))
+    origin, content = provenance(device, args.seed), dict[str, Any]()
+    for file in args.robots:
+        numbers = measure(file, device, args.seed)
+        rows = read_alike(args.out, origin, "sources_sha256", "seed").get("controllers", {})  # of other processes too
+        rows |= {file.parent.name: numbers}
+        named, planted = sum(row["named"] for row in rows.values()), sum(len(row["errors"]) for row in rows.values())
+        content = origin | {"named": named, "planted": planted, "controllers": rows}
+        write_atomically(args.out, to_json(content))
     return content
 
 
