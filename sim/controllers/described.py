@@ -19,7 +19,7 @@ from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_
 from sim.robots.robot import RobotCfg, needed_senses
 
 TERMS: dict[str, tuple[str, ...]] = {
-    "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit", "order"), "joint_pos": ("joints",),
+    "lin_vel": ("at",), "ang_vel": (), "gravity": (), "command": ("limit", "order"), "joint_pos": ("joints", "offset"),
     "joint_vel": ("joints",), "last_action": (), "clock": ("period_s", "order", "offset"),
     "constant": ("value",), "rpy": ("axes",), "heading": (), "quat": ("order",), "base_pos": (),
     "contacts": ("threshold",), "torques": ("joints",), "scan": ("order", "x", "y", "offset"),
@@ -60,7 +60,7 @@ class Term:
     y: tuple[float, ...] | None = None
     """Left of it [m]; the robot's ``scan_y`` if None."""
     offset: float | tuple[float, ...] | None = None
-    """Subtracted from the height of the base over the ground [m]; of a clock: that of each foot, in periods."""
+    """Subtracted from the height over the ground [m] or from angles [rad]; of a clock: of each foot, in periods."""
     value: float | tuple[float, ...] = 0.0
     """Numbers that never change."""
     axes: Annotated[str, Meta(pattern="^(roll|pitch|yaw)( (roll|pitch|yaw))*$")] | None = None
@@ -150,8 +150,8 @@ def read_controller(path: Path, text: str | None = None) -> ControllerCfg:
         term = from_builtins(Term, item, label)
         if term.order is not None and not re.fullmatch(_ORDERS[name], term.order):
             raise ValueError(f"{label}: order must be of the form {_ORDERS[name]}, got {term.order!r}")
-        if name == "scan" and isinstance(term.offset, tuple):
-            raise ValueError(f"{label}: offset must be a number [m], got {list(term.offset)}")
+        if name != "clock" and isinstance(term.offset, tuple):
+            raise ValueError(f"{label}: offset must be a number, got {list(term.offset)}")
         terms.append(term)
     return replace(from_builtins(ControllerCfg, content, str(path)), observation=tuple(terms))
 
@@ -317,8 +317,8 @@ class Described(torch.nn.Module):
         pose = dict(enumerate(robot_pose)) | dict(zip(self._moved, default, strict=True))
         columns: list[tuple[Any, ...]] = []  # zero, lower and upper limit, and scale
         for term, indices in zip(cfg.observation, self._columns, strict=True):
-            shift = term.offset or 0.0 if term.term == "scan" else 0.0
-            zeros = [pose[k] if term.term == "joint_pos" else shift for k in indices]
+            shift = term.offset or 0.0 if term.term in ("scan", "joint_pos") else 0.0
+            zeros = [pose[k] if term.term == "joint_pos" and term.offset is None else shift for k in indices]
             limits = np.broadcast_to(math.inf if term.limit is None else term.limit, 3)
             sizes = limits[[k % 3 for k in indices]]  # only those of a command differ
             low, high = np.clip([-sizes, sizes], *_limits(term.clip))

@@ -9,6 +9,7 @@ from typing import Any
 from sim.controllers.formats.deploy_yaml import DeployYaml
 from sim.controllers.formats.holosoma import Holosoma
 from sim.controllers.formats.isaac_lab import IsaacLab
+from sim.controllers.formats.leapp import Leapp
 from sim.controllers.formats.legged_gym import LeggedGym
 from sim.controllers.formats.mjlab import Mjlab
 from sim.controllers.formats.rl_sar import RlSar
@@ -22,7 +23,7 @@ from sim.robots.compiled import PER_JOINT
 from sim.robots.model_files import MENAGERIE, find_model, find_robot_of_scene
 from sim.robots.user import NEW_NAME, is_new_name
 
-FORMATS = (IsaacLab(), DeployYaml(), UnitreeRlGym(), RlSar(), LeggedGym(), Mjlab(), Holosoma(), Weights())
+FORMATS = (IsaacLab(), DeployYaml(), UnitreeRlGym(), RlSar(), LeggedGym(), Leapp(), Mjlab(), Holosoma(), Weights())
 """Formats of sources: the first that matches a path reads it into a Source, and returns the file of the weights."""
 _ROBOT_SETTINGS = ("actuator_net", "drive_delay_steps", "physics_dt", "decimation", "speed", "max_duration_s")
 _ACTION_SETTINGS = ("policy", "joints", "action_scale", "action_offset", "action_clip")

@@ -1,8 +1,10 @@
 """What trainings and vendors leave becomes a robot and a controller, which load and mean the same."""
 
+import hashlib
 import json
 import re
 
+import numpy as np
 import onnx
 import pytest
 import torch
@@ -12,7 +14,7 @@ from sim.controllers.described import read_controller
 from sim.controllers.imports import import_controller
 from sim.controllers.loaders import load_policy
 from sim.robots.find import get_robot
-from tests.sim.controllers.test_onnx import linear
+from tests.sim.controllers.test_onnx import graph_model, linear, make_nodes, port
 from tests.sim.dogs import JOINTS, mjcf
 
 RIGHT_FIRST = ["FR_hip", "FR_knee", "FL_hip", "FL_knee", "HR_hip", "HR_knee", "HL_hip", "HL_knee"]
@@ -186,6 +188,30 @@ def deploy(folder, *changes):
     (folder / "exported").mkdir()
     onnx.save(linear(3 * 18, 8, batch=1), folder / "exported" / "policy.onnx")
     return folder
+
+
+def leapp(folder, kp="gains", **changes):
+    """Targets that follow half of the angle off a pose, of joints in another order, and a state."""
+    nodes = make_nodes(
+        "Sub joint_pos pose > off", "Mul off half > action", "Add action pose > targets", "Add past half > past_out",
+        f"Add {kp} half > kp", "Identity gains > kd",
+    )  # fmt: skip
+    numbers = {"pose": np.float32(POSE), "half": np.float32([0.5]), "gains": np.full((1, 8), 20.0, "f4")}
+    weights = [onnx.numpy_helper.from_array(value, name) for name, value in numbers.items()]
+    kinds = {"quat_w": "state/body/rotation", "joint_pos": "state/joint/position", "past": None,
+             "targets": "target/joint/position", "past_out": None, "kp": "kp", "kd": "kd"}  # fmt: skip
+    names = {"quat_w": [list("xyzw")]}
+    items = [
+        {"name": name, "kind": kind, "element_names": names.get(name, [RIGHT_FIRST]), "is_state": kind is None}
+        for name, kind in kinds.items()
+    ]
+    ports = [port(name, [1, 4 if name == "quat_w" else 8]) for name in kinds]
+    onnx.save(graph_model(nodes, ports[:3], ports[3:], weights), folder / "policy.onnx")
+    digest = hashlib.sha256((folder / "policy.onnx").read_bytes()).hexdigest()
+    parameters = {"model_path": "policy.onnx", "sha256sum": digest}
+    model = {"inputs": items[:3], "outputs": items[3:], "parameters": parameters} | changes
+    pipeline = {"feedback_flow": {"it/past_out": ["it/past"]}, "configs": {"frequency": 25.0}}
+    return write(folder / "it.yaml", {"models": {"it": model}, "pipeline": pipeline})
 
 
 def imported(source, tmp_path, old="", new=""):
@@ -373,6 +399,15 @@ def test_an_actuator_network_of_isaac_lab_stands_in_place_of_gains(tmp_path):
     assert "# stiffness" not in lines and "effort_limit = 20.0" in lines
 
 
+@pytest.mark.filterwarnings("ignore:policy.*more than actions")
+def test_a_policy_of_leapp_is_read(tmp_path):
+    robot, controller = imported(leapp(tmp_path), tmp_path)
+    assert (robot.stiffness, robot.damping, robot.default_joint_pos) == ((20.5,) * 8, (20.0,) * 8, IN_FILE)
+    assert (robot.physics_dt, robot.decimation, controller.joints) == (0.01, 4, tuple(RIGHT_FIRST))
+    quat, joint_pos = controller.observation
+    assert (quat.term, quat.order, joint_pos.joints, joint_pos.offset) == ("quat", "x y z w", tuple(RIGHT_FIRST), 0.0)
+
+
 def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_taken(tmp_path, capsys):
     state = {"actor.0.weight": torch.zeros(8, 36), "actor.0.bias": torch.zeros(8)}
     torch.save({"model_state_dict": state}, tmp_path / "model_9.pt")
@@ -424,6 +459,13 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (lambda folder: deploy(folder, ("step_dt:", "gear: 1\nstep_dt:")), {}, "gear"),
         (holosoma, {"experiment_config": None}, "it must see 37 columns"),
         (holosoma, {"experiment_config": None, "width": 37}, "neither G1 nor T1"),
+        (leapp, {"parameters": {"model_path": "policy.onnx", "sha256sum": "0"}}, "policy.onnx must have sha256sum 0"),
+        (leapp, {"kp": "joint_pos"}, "kp must be constant"),
+        (
+            leapp,
+            {"inputs": [{"name": name, "kind": "rays"} for name in ("quat_w", "joint_pos", "past")]},
+            "quat_w, a rays",
+        ),
         (lambda folder: folder, {}, "a run of Isaac Lab (a folder with params/env.yaml), or a deployment of"),
     ],
 )

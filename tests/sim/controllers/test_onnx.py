@@ -25,6 +25,12 @@ def graph_model(nodes, inputs, outputs, weights=()):
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
+def make_nodes(*steps):
+    """Nodes from texts such as ``Sub rows mean > centred``."""
+    ends = [[end.split() for end in step.split(" > ")] for step in steps]
+    return [helper.make_node(kind, inputs, outputs) for (kind, *inputs), outputs in ends]
+
+
 def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=None, bias=None):
     """One layer, as a foreign exporter would write it: other names than ours."""
     weight = np.random.default_rng(3).normal(size=(actions, observations)).astype(np.float32) / 10
@@ -50,8 +56,7 @@ def chain(last, bound=False):
         "Mul centred factor > rows", "Gemm rows w0 b0 > hidden", "Sigmoid hidden > gate",
         "Mul hidden gate > swish", "Gemm swish w1 b1 > out", "Split out > mode spread", f"{last} mode > actions",
     )  # fmt: skip
-    ends = [[end.split() for end in step.split(" > ")] for step in steps]
-    nodes = [helper.make_node(kind, inputs, outputs) for (kind, *inputs), outputs in ends]
+    nodes = make_nodes(*steps)
     nodes[-2].attribute.append(helper.make_attribute("axis", -1))
     tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
     return graph_model(nodes, [port("obs", [1, width])], [port("actions", [1, ACTIONS])], tensors), weights
