@@ -53,24 +53,24 @@ class Publisher:
     moved: Sequence[int] | None = None  # numbers of the joints that it moves; all if None
 
 
-def read_mjcf(path: Path) -> Any:
-    """An MJCF's specification without meshes that are not there: those of a clone without its large files."""
+def read_mjcf(path: Path) -> tuple[Any, list[Any]]:
+    """An MJCF's specification, and the meshes that are not there, as in a clone without large files: it has none."""
     spec = mj.MjSpec.from_file(str(path))
     missing = [mesh for mesh in spec.meshes if not (path.parent / spec.meshdir / mesh.file).is_file()]
     names = {mesh.name or Path(mesh.file).stem for mesh in missing}
     for geom in [geom for geom in spec.geoms if geom.meshname in names]:
         spec.delete(geom)
-    for geom in spec.geoms if missing else ():
-        geom.material = ""
-    for element in [*missing, *spec.textures, *spec.materials] if missing else ():
+    for material in spec.materials if missing else ():
+        material.textures = [""] * len(material.textures)
+    for element in [*missing, *spec.textures] if missing else ():
         spec.delete(element)
-    return spec
+    return spec, missing
 
 
 def load_model(publisher: Publisher) -> Any:
     """The publisher's model on level ground."""
     is_urdf = publisher.model.suffix == ".urdf"
-    spec = mj.MjSpec.from_string(_free_urdf(publisher.model)) if is_urdf else read_mjcf(publisher.model)
+    spec = mj.MjSpec.from_string(_free_urdf(publisher.model)) if is_urdf else read_mjcf(publisher.model)[0]
     for geom in spec.geoms:
         geom.conaffinity *= not is_urdf  # robots do not touch themselves, as in Isaac Lab
     if not any(geom.type == mj.mjtGeom.mjGEOM_PLANE for geom in spec.geoms):
@@ -324,16 +324,14 @@ def judo(root: Path) -> Publisher:
     for number, name in arm.items():
         joints.insert(number, f"arm_{name}")
     pose = np.array([0.0, 0.12, -0.12, 0.12, -0.12, -0.9, *[0.5] * 4, 1.8, *[-1.0] * 4, 0.0, -0.9, 0.0, -1.54])
-    default = pose.copy()
-    default[18] = 0.0  # the gripper is closed
 
     def observe(s: State) -> Array:
-        row = [s.lin_vel, s.gyro, s.gravity, s.command, default[list(arm)], np.zeros(12), [0.0, 0.0, 0.52]]
+        row = [s.lin_vel, s.gyro, s.gravity, s.command, pose[list(arm)], np.zeros(12), [0.0, 0.0, 0.52]]
         return np.concatenate([*row, s.q - pose, s.dq, s.action])
 
     model, network = root / "xml/spot_primitive/robot.xml", root / "policies/spot_locomotion.onnx"
     moved = [k for k in range(19) if k not in arm]
-    return Publisher(model, network, joints, default, observe, 0.2, 0.01, moved=moved)
+    return Publisher(model, network, joints, pose, observe, 0.2, 0.01, moved=moved)
 
 
 def robogauge(root: Path) -> Publisher:
