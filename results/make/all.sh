@@ -45,9 +45,9 @@ for robot in "${robots[@]}"; do
   "$python" -m results.make.speed --robot "$robot"                    # 7 min; what is done is not done again
   "$python" -m results.make.speed --robot "$robot" --device cpu       # 4 min, and to be quoted where two cores are free
 done
-if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as docs/controllers.md says
-  "$python" -m results.make.public "$PUBLIC"                            # 42 min
-  "$python" -m results.make.public "$PUBLIC" --pictures                 # 1 min, no GPU
+if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as results/make/public.toml says
+  "$python" -m results.make.public "$PUBLIC"                            # 50 min
+  "$python" -m results.make.public "$PUBLIC" --films                    # some minutes, no GPU
 fi
 "$python" -m tests.bench                                              # 3 min
 FAULTLINE_DEVICE=cuda:0 "$python" -m pytest -q -m gpu --record=results/bench/gpu-tests.json # 4 min

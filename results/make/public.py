@@ -30,7 +30,7 @@ from qd.workers.compute import Compute
 from qd.workers.crosser import Crosser
 from results.make.common import COUNTS, read_alike, runs_of_today
 from results.make.pictures import FOLDER as PICTURES
-from results.make.publishers import PUBLISHERS, read_mjcf, walk
+from results.make.publishers import LEAGUE, PUBLISHERS, read_mjcf, walk
 from results.make.speed import time_crossings
 from sim.controllers.imports import import_controller
 from sim.device import resolve_device
@@ -43,8 +43,6 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
 
-LEAGUE = read_toml(Path(__file__).with_suffix(".toml"))
-"""Repositories with their licence, and controllers with their source and what is filled in."""
 CONTROLLERS = LEAGUE["controllers"]
 ITERATIONS = 4
 """Of preset wide."""
@@ -145,7 +143,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
             **{f"flat_{key}": value for key, value in walks["searched"].items()},
             **{f"flat_{key}_mujoco_c": value for key, value in walks["mujoco_c"].items()},
             **{f"flat_{key}_publisher": value for key, value in by_publisher.items()},
-            "publisher_loop": getattr(PUBLISHERS[name], "func", PUBLISHERS[name]).__doc__,
+            "publisher_loop": PUBLISHERS[name].func.__doc__,
         },
         "rates": rates,
         "dose": dose["dose"],

@@ -10,6 +10,7 @@ joints, command vx, vy [m/s] and yaw rate [rad/s], action, the network's last, s
 
 import argparse
 import json
+import tomllib
 import xml.etree.ElementTree as ET
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -370,27 +371,11 @@ def leapp(root: Path) -> Publisher:
     return Publisher(model, network, joints, default, observe, 1.0, 0.005, kp, kd, offset=0.0, moved=moved)
 
 
-_GO2 = "unitree/go2_description/urdf/go2_description.urdf"
-PUBLISHERS: dict[str, Callable[[Path], Publisher]] = {
-    "go2-robot-lab": partial(rl_sar, "go2", "robot_lab", _GO2),
-    "go2-himloco": partial(rl_sar, "go2", "himloco", _GO2),
-    "go2-cts": robogauge,
-    "go1-playground": playground,
-    "b2-robot-lab": partial(rl_sar, "b2", "robot_lab", "unitree/b2_description/urdf/b2_description.urdf"),
-    "lite3-himloco": partial(rl_sar, "lite3", "himloco", "deeprobotics/lite3_description/urdf/lite3.urdf"),
-    "spot-judo": judo,
-    "h1-unitree": partial(unitree_rl_gym, "h1", "h1/h1.xml"),
-    "h1-2-unitree": partial(unitree_rl_gym, "h1_2", "h1_2/h1_2_12dof.xml"),
-    "gr1t1": partial(rl_sar, "gr1t1", "legged_gym", "fftai/gr1t1_description/urdf/GR1T1_lower_limb.urdf"),
-    "g1-unitree": partial(unitree_rl_gym, "g1", "g1_description/g1_12dof.xml"),
-    "g1-29-unitree-lab": unitree_rl_lab,
-    "g1-holosoma-ppo": partial(holosoma, "g1", "ppo"),
-    "g1-holosoma-fastsac": partial(holosoma, "g1", "fastsac"),
-    "g1-leapp": leapp,
-    "t1-booster": booster,
-    "t1-holosoma-ppo": partial(holosoma, "t1", "ppo"),
-    "t1-holosoma-fastsac": partial(holosoma, "t1", "fastsac"),
-}
+LOOPS = (rl_sar, unitree_rl_gym, playground, holosoma, booster, unitree_rl_lab, judo, robogauge, leapp)
+_BY_NAME: dict[str, Callable[..., Publisher]] = {loop.__name__: loop for loop in LOOPS}
+LEAGUE = tomllib.loads(Path(__file__).with_name("public.toml").read_text())
+"""Repositories and controllers."""
+PUBLISHERS = {name: partial(_BY_NAME[row["loop"][0]], *row["loop"][1:]) for name, row in LEAGUE["controllers"].items()}
 """Each controller as its publisher runs it, from the folder of the repositories."""
 
 
