@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from qd.check import ensure_ready, prepare_level_ground
+from qd.check import ensure_ready
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
 from qd.evaluate.level import measure_level_ground
@@ -85,15 +85,14 @@ def copy_model(model: Path) -> Path:
 
 
 def ready(name: str, folder: Path, runs: Path, compute: Compute) -> RobotCfg:
-    """The robot of a controller, imported with it, with time for a crossing; nothing is measured again."""
+    """The robot of a controller, imported with it, with time for a crossing and scales."""
     chosen, home = CONTROLLERS[name], runs / name
     if not (home / "robot.toml").exists():
         model = folder / chosen["model"] if "model" in chosen else PUBLISHERS[name](folder).model
         import_controller(folder / chosen["source"], copy_model(model), home)
         for part in ("controller", "robot"):
             fill_in(home / f"{part}.toml", chosen.get(part, ""))
-    robot = get_robot(str(home / "robot.toml"))
-    return prepare_level_ground(robot, str(robot.policy_file), compute)
+    return ensure_ready(get_robot(str(home / "robot.toml")), None, compute)
 
 
 def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
@@ -104,7 +103,6 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     with Crosser(robot, compute, cache=runs / "crossings") as crosser:
         walks = measure_level_ground(crosser, policy, mujoco_c=True)
     by_publisher = walk(publisher, episodes=2 if small else 20, speed=robot.speed, duration_s=robot.max_duration_s)
-    robot = ensure_ready(robot, None, compute)
     rates, sizes = dict[str, Any](), {"terrains": 4, "episodes": 1} if small else RATES
     for height in HEIGHTS[: 1 if small else None]:
         out, at = runs / f"{name}-rates-{height:g}.json", at_height(SUPER_GAUSSIAN, height).name
