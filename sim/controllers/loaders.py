@@ -160,34 +160,17 @@ def _load_encoded(policy: Described, weights: Path, path: Path, load: functools.
     """The networks of two files; the policy sees the whole observation, or that of the present step."""
     encoder = weights_file(path, "encoder")
     if encoder is None or not os.path.isfile(encoder):
-        raise ValueError(
-            f"{path}: encoder must name a file of weights beside it, got {policy.cfg.encoder!r}: put it there"
-        )
-    size = policy.observation_size
-    newest = _find_newest(policy)
+        raise ValueError(f"{path}: encoder must name a file of weights beside it, got {policy.cfg.encoder!r}")
+    size, history = policy.observation_size, policy.cfg.history
+    sizes = {size, sum(policy.widths) if history is not None and history.by == "row" else size}
     width, count = find_widths(load(weights, sizes=None))[0], find_widths(load(encoder, sizes=None))[1]
-    columns = {size: range(size), len(newest): newest}.get((width or 0) - (count or 0))
-    if columns is None or not count:
+    seen = (width or 0) - (count or 0)
+    if not count or seen not in sizes:
         what = f"encoder returns {count} columns and {weights.name} takes {width}"
-        must = f"beside them it must see all {size} of the observation, or {len(newest)} of a step"
-        raise ValueError(f"{path}: {what}: {must}")
+        raise ValueError(f"{path}: {what}: beside them it must see {' or '.join(map(str, sizes))} of the observation")
+    start = size - seen if history is not None and history.newest == "last" else 0
     networks = load(weights, sizes=(width, policy.num_actions)), load(encoder, sizes=(size, count))
-    return Encoded(*networks, columns, policy.cfg.encoder_first).to(load.keywords["device"])
-
-
-def _find_newest(policy: Described) -> list[int]:
-    """The network's columns of the present control step."""
-    history = policy.cfg.history
-    blocks = zip(policy.widths, policy.lengths, strict=True)
-    if history is not None and history.by == "row":
-        blocks = [(sum(policy.widths), history.length)]
-    columns: list[int] = []
-    start = 0
-    for width, length in blocks:
-        first = start + (width * (length - 1) if history is not None and history.newest == "last" else 0)
-        columns += range(first, first + width)
-        start += width * length
-    return columns
+    return Encoded(*networks, slice(start, start + seen), policy.cfg.encoder_first)
 
 
 @torch.inference_mode()

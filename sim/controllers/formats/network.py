@@ -3,7 +3,7 @@
 import functools
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -71,24 +71,23 @@ def find_widths(network: Any) -> tuple[int | None, int | None]:
 class Encoded(torch.nn.Module):
     """A policy of some columns of the observation, and of what an encoder makes of them all."""
 
-    def __init__(self, policy: Any, encoder: Any, columns: Sequence[int], encoder_first: bool) -> None:
+    def __init__(self, policy: Any, encoder: Any, columns: slice, encoder_first: bool) -> None:
         super().__init__()
-        self.policy = policy
-        self.encoder = encoder
-        self.columns = torch.nn.Buffer(torch.tensor(columns))
-        self._encoder_first = encoder_first
+        self._networks = policy, encoder
+        self._columns = columns
+        self._order = -1 if encoder_first else 1
         self.graph_safe = is_graph_safe(policy) and is_graph_safe(encoder)
 
     def reset(self, rows: torch.Tensor) -> None:
         """Begin anew where ``rows``, bool, shape (num_envs,), is true."""
-        for network in (self.policy, self.encoder):
+        for network in self._networks:
             if hasattr(network, "reset"):
                 network.reset(rows)
 
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """Actions, shape (num_envs, num_joints)."""
-        seen = [rows[:, self.columns], self.encoder(rows)]
-        return self.policy(torch.cat(seen[::-1] if self._encoder_first else seen, dim=1))
+        policy, encoder = self._networks
+        return policy(torch.cat([rows[:, self._columns], encoder(rows)][:: self._order], dim=1))
 
 
 def _take_actions(output: Any) -> Any:

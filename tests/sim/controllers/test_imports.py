@@ -193,8 +193,8 @@ def deploy(folder, *changes):
 def leapp(folder, kp="gains", **changes):
     """Targets that follow half of the angle off a pose, of joints in another order, and a state."""
     nodes = make_nodes(
-        "Sub joint_pos pose > off", "Mul off half > action", "Add action pose > targets", "Add past half > past_out",
-        f"Add {kp} half > kp", "Identity gains > kd",
+        f"Add {kp} half > kp", "Identity gains > kd", "Add past half > past_out", "Sub joint_pos pose > off",
+        "Mul off half > action", "Add action pose > targets",
     )  # fmt: skip
     numbers = {"pose": np.float32(POSE), "half": np.float32([0.5]), "gains": np.full((1, 8), 20.0, "f4")}
     weights = [onnx.numpy_helper.from_array(value, name) for name, value in numbers.items()]
