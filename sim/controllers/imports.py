@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from sim.controllers.formats.booster import Booster
 from sim.controllers.formats.deploy_yaml import DeployYaml
 from sim.controllers.formats.holosoma import Holosoma
 from sim.controllers.formats.isaac_lab import IsaacLab
@@ -23,13 +24,16 @@ from sim.robots.compiled import PER_JOINT
 from sim.robots.model_files import MENAGERIE, find_model, find_robot_of_scene
 from sim.robots.user import NEW_NAME, is_new_name
 
-FORMATS = (IsaacLab(), DeployYaml(), UnitreeRlGym(), RlSar(), LeggedGym(), Leapp(), Mjlab(), Holosoma(), Weights())
+FORMATS = (
+    *(IsaacLab(), DeployYaml(), UnitreeRlGym(), RlSar(), LeggedGym(), Booster(), Leapp()),
+    *(Mjlab(), Holosoma(), Weights()),
+)
 """Formats of sources: the first that matches a path reads it into a Source, and returns the file of the weights."""
 _ROBOT_SETTINGS = ("actuator_net", "drive_delay_steps", "physics_dt", "decimation", "speed", "max_duration_s")
 _ACTION_SETTINGS = ("policy", "joints", "action_scale", "action_offset", "action_clip")
 _OBSERVATION_SETTINGS = ("observation_clip", "activation", "history", "observation")
 _SETTINGS_BY_FILE = {
-    "robot.toml": ("model_file", *PER_JOINT, *_ROBOT_SETTINGS),
+    "robot.toml": ("model_file", *PER_JOINT, *_ROBOT_SETTINGS, "scan_x", "scan_y"),
     "controller.toml": (*_ACTION_SETTINGS, *_OBSERVATION_SETTINGS),
 }
 

@@ -3,18 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-from sim.controllers.formats.source import Source, collapse, find_checkpoint, make_term
+from sim.controllers.formats.isaac_lab import ISAAC_LAB_TERMS, read_action, read_term
+from sim.controllers.formats.source import Source, collapse, find_checkpoint
 from sim.files.settings import YAML_SUFFIXES, read_yaml
 
-_TERMS = {
-    "base_ang_vel": "ang_vel",
-    "projected_gravity": "gravity",
-    "velocity_commands": "command",
-    "joint_pos_rel": "joint_pos",
-    "joint_vel_rel": "joint_vel",
-    "last_action": "last_action",
-    "gait_phase": "clock",
-}
+_FUNCTIONS = {name: name for name in ISAAC_LAB_TERMS if name != "height_scan"}
+_FUNCTIONS["velocity_commands"] = "generated_commands"
 _STEPS = 4  # physics steps a control step, in the tasks of both
 
 
@@ -47,39 +41,42 @@ class DeployYaml:
         source.move(content, dict(zip(names, names, strict=True)), joints)
         reason = f"{file.name} says the control step alone; the tasks of its makers have {_STEPS} physics steps in it"
         source.set(physics_dt=round(content.pop("step_dt") / _STEPS, 6), decimation=_STEPS, reason=reason)
-        moved = _read_action(content.pop("actions"), default, source)
-        by_motors = "the order in which the motors of a limb follow each other; joints are numbered, not named"
-        source.set(joints=moved, reason=by_motors)
-        _read_observations(content.pop("observations"), joints, moved, content.pop("commands"), source)
-        source.refuse_unknown(content, ())
+        actions = content.pop("actions")
+        for name, action in actions.items():
+            moved = _select_joints(action.get("joint_ids"), joints)
+            is_usual = action.get("offset") == [default[joint] for joint in moved]
+            action |= {"class_type": name, "joint_names": moved, "preserve_order": True, "use_default_offset": is_usual}
+        robot = {"joint_ordering": joints}
+        read_action({"actions": actions, "scene": {"robot": robot}, "sim": {}}, file.parent, source, None)
+        reason = "the order in which the motors of a limb follow each other; joints are numbered, not named"
+        source.set(joints=source.settings.get("joints", joints), reason=reason)
+        terms, commands = content.pop("observations"), content.pop("commands")
+        by = "row" if terms.pop("use_gym_history", False) else "term"
+        source.refuse_unknown([*content, *terms], _FUNCTIONS)
+        rows = []
+        for name, item in terms.items():
+            params = dict(item["params"] or {})
+            selected = _select_joints((params.get("asset_cfg") or {}).get("joint_ids"), joints)
+            params["asset_cfg"] = {"joint_names": selected, "preserve_order": True}
+            item |= {"func": _FUNCTIONS[name], "params": params, "scale": collapse(item.get("scale"))}
+            row = read_term(name, item, {}, joints, source)
+            if row["term"] == "command":
+                row["limit"] = source.read_ranges(commands[params["command_name"]]["ranges"])
+            rows.append(row)
+        source.set_history(rows, [item.get("history_length") or 1 for item in terms.values()], by=by)
+        source.set(observation=rows)
         return find_checkpoint(file.parent.parent, "exported/policy.onnx", f"{file.parent.name}/policy.onnx")
 
 
 def _find_order(motors: list[int], source: Source) -> list[str]:
     """Names of the joints that have these motors: by mjlab in the model's order, by Isaac Lab breadth first."""
-    paths = source.joint_paths()
 
     def count_neighbours(joints: list[str]) -> int:
         motor_by_joint = dict(zip(joints, motors, strict=True))
-        pairs = [path[-2:] for path in paths if len(path) > 1]
+        pairs = [path[-2:] for path in source.joint_paths() if len(path) > 1]
         return sum(motor_by_joint[joint] == motor_by_joint[parent] + 1 for parent, joint in pairs)
 
     return max(list(source.joints), source.sort_breadth_first(), key=count_neighbours)
-
-
-def _read_action(actions: dict[str, Any], default: dict[str, float], source: Source) -> list[str]:
-    """Scale and offset of the targets, with the default pose of all joints; returns those that they move."""
-    if list(actions) != ["JointPositionAction"]:
-        raise ValueError(f"{source.file}: actions must be one JointPositionAction, got {', '.join(actions)}")
-    action = actions["JointPositionAction"]
-    if action.get("clip") is not None:
-        raise ValueError(f"{source.file}: actions.clip limits targets, which is not supported: give joints that range")
-    moved = _select_joints(action.get("joint_ids"), list(default))
-    source.set(action_scale=collapse(action["scale"]))
-    offset = action.get("offset") or [0.0] * len(moved)
-    if offset != [default[joint] for joint in moved]:
-        source.set(action_offset=[float(angle) for angle in offset])
-    return moved
 
 
 def _select_joints(indices: Any, joints: list[str]) -> list[str]:
@@ -87,33 +84,3 @@ def _select_joints(indices: Any, joints: list[str]) -> list[str]:
     if indices is None or None in indices:
         return joints[slice(*indices or [None])]
     return [joints[k] for k in indices]
-
-
-def _read_observations(
-    groups: dict[str, Any], joints: list[str], moved: list[str], commands: dict[str, Any], source: Source
-) -> None:
-    """Terms in their order; they may be in a table of their own, as the network's input is called."""
-    first = next(iter(groups.values()))
-    terms = dict(first if len(groups) == 1 and "params" not in first else groups)
-    by_row = terms.pop("use_gym_history", False)
-    scale_first = terms.pop("scale_first", False)
-    source.refuse_unknown(terms, _TERMS)
-    rows = []
-    for name, item in terms.items():
-        if "params" not in item:
-            raise ValueError(f"{source.file}: observations must be those of one input, got {', '.join(terms)}")
-        if scale_first and item.get("clip"):
-            raise ValueError(f"{source.file}: scale_first is not supported, where {name} has a clip")
-        params = item["params"] or {}
-        row = make_term(_TERMS[name], collapse(item.get("scale")), clip=item.get("clip"))
-        if row["term"] == "command":
-            row["limit"] = source.read_ranges(commands[params["command_name"]]["ranges"])
-        elif row["term"] == "clock":
-            row["period_s"] = params["period"]
-        elif row["term"].startswith("joint"):
-            selected = _select_joints((params.get("asset_cfg") or {}).get("joint_ids"), joints)
-            row |= {"joints": selected} if selected != moved else {}
-        rows.append(row)
-    lengths = [item.get("history_length") or 1 for item in terms.values()]
-    source.set_history(rows, lengths, by="row" if by_row else "term")
-    source.set(observation=rows)

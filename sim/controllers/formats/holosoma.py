@@ -7,23 +7,12 @@ from typing import Any
 
 from sim.controllers.formats.network import find_widths, load_network
 from sim.controllers.formats.onnx_data import read_metadata
-from sim.controllers.formats.source import Source, make_term
+from sim.controllers.formats.source import TERM_NAMES, Source, make_term
 from sim.robots.user import per_joint
 
-_TERMS: dict[str, dict[str, Any]] = {
-    "actions": {"name": "last_action"},
-    "base_ang_vel": {"name": "ang_vel"},
-    "base_lin_vel": {"name": "lin_vel"},
-    "command_ang_vel": {"name": "command", "order": "yaw_rate"},
-    "command_lin_vel": {"name": "command", "order": "v_x v_y"},
-    "cos_phase": {"name": "clock", "order": "cos"},
-    "dof_pos": {"name": "joint_pos"},
-    "dof_vel": {"name": "joint_vel"},
-    "projected_gravity": {"name": "gravity"},
-    "sin_phase": {"name": "clock", "order": "sin"},
-}
-_FEET = [0.0, 0.5]  # phases of the left and the right foot, in periods
-_LOCOMOTION = {*_TERMS} - {"base_lin_vel"}
+_ORDERS = {"command_ang_vel": "yaw_rate", "command_lin_vel": "v_x v_y", "sin_phase": "sin", "cos_phase": "cos"}
+_TERMS = TERM_NAMES | {name: "clock" if "phase" in name else "command" for name in _ORDERS}
+_LOCOMOTION = ("actions", "base_ang_vel", "dof_pos", "dof_vel", "projected_gravity", *_ORDERS)
 _G1_POSE = {".*_hip_pitch_joint": -0.312, ".*_knee_joint": 0.669, ".*_ankle_pitch_joint": -0.363, ".*_elbow_joint": 0.6}
 _G1_POSE |= {".*_shoulder_pitch_joint": 0.2, "left_shoulder_roll_joint": 0.2, "right_shoulder_roll_joint": -0.2}
 _T1_POSE = {".*_Hip_Pitch": -0.2, ".*_Knee_Pitch": 0.4, ".*_Ankle_Pitch": -0.25, ".*_Shoulder_Pitch": 0.2}
@@ -77,12 +66,12 @@ class Holosoma:
         group = cfg["observation"]["groups"]["actor_obs"]
         source.refuse_unknown(group["terms"], _TERMS)
         rows = []
+        more = {"clock": {"period_s": period, "offset": [0.0, 0.5]}, "command": {"limit": limits}}  # left, right foot
         for name, item in sorted(group["terms"].items()):  # as holosoma orders them
             if item.get("clip") is not None:
                 raise ValueError(f"{source.file}: the clip of {name} is not supported")
-            row = make_term(scale=item.get("scale"), **_TERMS[name])
-            row |= {"clock": {"period_s": period, "offset": _FEET}, "command": {"limit": limits}}.get(row["term"], {})
-            rows.append(row)
+            term = _TERMS[name]
+            rows.append(make_term(term, item.get("scale"), order=_ORDERS.get(name), **more.get(term, {})))
         source.set_history(rows, [group.get("history_length", 1)] * len(rows), fill="zeros")
         source.set(observation=rows, reason=reason)
         return path

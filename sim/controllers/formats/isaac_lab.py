@@ -13,7 +13,7 @@ from sim.files.settings import read_yaml, to_toml
 from sim.robots.compiled import PER_JOINT
 from sim.robots.user import per_joint
 
-_ISAAC_LAB_TERMS = {
+ISAAC_LAB_TERMS = {
     "base_lin_vel": "lin_vel",
     "base_ang_vel": "ang_vel",
     "projected_gravity": "gravity",
@@ -24,6 +24,7 @@ _ISAAC_LAB_TERMS = {
     "height_scan": "scan",
     "gait_phase": "clock",
 }
+"""Terms of the observation by the names of Isaac Lab's functions."""
 _NET_SETTINGS = ("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
 _IDEAL_DRIVE = {"saturation_effort": 1e6, "velocity_limit": 1e6}  # stands beside joints with a DC motor
 
@@ -54,7 +55,7 @@ class IsaacLab:
         source.set_speed(
             next((ranges for command in commands if "lin_vel_x" in (ranges := command.get("ranges") or {})), {})
         )
-        joint_order = _read_action(env, path, source, agent.get("clip_actions"))
+        joint_order = read_action(env, path, source, agent.get("clip_actions"))
         observation_groups = agent.get("obs_groups") or {}
         rows, lengths = [], []
         for group_name in observation_groups.get("actor") or observation_groups.get("policy") or ["policy"]:
@@ -62,7 +63,7 @@ class IsaacLab:
             terms = {name: term for name, term in group.items() if isinstance(term, dict)}
             common = group.get("history_length")
             lengths += [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
-            rows += [_read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
+            rows += [read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
         source.set_history(rows, lengths)
         reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
         source.set(observation=rows, reason=reason)
@@ -140,7 +141,7 @@ def _order_joints(env: dict[str, Any], path: Path, source: Source) -> tuple[list
     return source.sort_breadth_first(), "breadth first, as PhysX orders joints; IO_descriptors.yaml would say it"
 
 
-def _read_action(env: dict[str, Any], path: Path, source: Source, limit: float | None) -> list[str]:
+def read_action(env: dict[str, Any], path: Path, source: Source, limit: float | None) -> list[str]:
     """Scale, offset, limits and joints of the action, which ``limit`` clips; returns the order of all joints."""
     actions = env["actions"]
     joint_order, reason = _order_joints(env, path, source)
@@ -171,16 +172,17 @@ def _read_action(env: dict[str, Any], path: Path, source: Source, limit: float |
     return joint_order
 
 
-def _read_term(
+def read_term(
     name: str, term: dict[str, Any], scene: dict[str, Any], joint_order: Sequence[str], source: Source
 ) -> dict[str, Any]:
+    """A term of the observation; a height scan is one of the scene's sensors."""
     function = re.split(r"[:.]", str(term["func"]))[-1]
     params = term.get("params") or {}
-    if function not in _ISAAC_LAB_TERMS or term.get("modifiers"):
+    if function not in ISAAC_LAB_TERMS or term.get("modifiers"):
         what = f"observation {name}, {term['func']}{' with modifiers' * bool(term.get('modifiers'))}"
-        raise ValueError(f"{source.file} says what is not understood: {what}; only {', '.join(_ISAAC_LAB_TERMS)}")
+        raise ValueError(f"{source.file} says what is not understood: {what}; only {', '.join(ISAAC_LAB_TERMS)}")
     centre = source.model.body_ipos[1].round(5).tolist() if function == "base_lin_vel" else None
-    row = make_term(_ISAAC_LAB_TERMS[function], term.get("scale"), clip=term.get("clip"), at=centre)
+    row = make_term(ISAAC_LAB_TERMS[function], term.get("scale"), clip=term.get("clip"), at=centre)
     if function in ("joint_pos_rel", "joint_vel_rel"):
         asset = params.get("asset_cfg") or {}
         joints = _match_joints(asset.get("joint_names") or ".*", joint_order, asset.get("preserve_order"))

@@ -123,6 +123,21 @@ HOLOSOMA = {
         }}}},
     },
 }  # fmt: skip
+SCAN = """
+sim: {mujoco: {timestep: 0.002}}
+decimation: 10
+scene: {sensors: [{name: terrain, ray_alignment: yaw, frame: {type: body, name: trunk, entity: robot},
+  pattern: {size: !!python/tuple [0.4, 0.2], resolution: 0.2}}]}
+observations: {actor: {terms: {height_scan: {params: {sensor_name: terrain, offset: 0.1}}}}}
+"""
+BOOSTER = {
+    "common": {"dt": 0.002, "default_qpos": [9, 0, *[0.6, -1.2] * 4], "stiffness": [9, 9, *[200, 50] * 4],
+               "damping": [9, 9, *[5, 3] * 4], "torque_limit": [9, 9, *[30, 20] * 4]},
+    "policy": {"policy_path": "./models/it.pt", "num_actions": 8, "num_observations": 35, "gait_frequency": 2.0,
+               "control": {"action_scale": 0.5, "decimation": 10},
+               "normalization": {"gravity": 1, "lin_vel": 1, "ang_vel": 0.5, "dof_pos": 1, "dof_vel": 0.1,
+                                 "clip_actions": 1.0}},
+}  # fmt: skip
 
 
 def write(file, content):
@@ -156,8 +171,8 @@ def legged_gym(folder, width=36, old=None, row=None, **changes):
     return write(folder / "cfg.json", json.dumps(LEGGED_GYM | env | changes))
 
 
-def mjlab(folder, **changes):
-    model = linear(42, 8, batch=1)
+def mjlab(folder, width=42, **changes):
+    model = linear(width, 8, batch=1)
     onnx.helper.set_model_props(model, MJLAB | changes)
     onnx.save(model, folder / "run.onnx", save_as_external_data=True, location="run.data", size_threshold=0)
     return folder / "run.onnx"
@@ -169,6 +184,19 @@ def holosoma(folder, width=2 * 37, **changes):
     onnx.helper.set_model_props(model, content)
     onnx.save(model, folder / "loco.onnx")
     return folder / "loco.onnx"
+
+
+def booster(folder, trained=False, **changes):
+    policy, common = BOOSTER["policy"] | changes, BOOSTER["common"]
+    write(folder / "deploy" / "models" / "it.pt", 35)
+    if not trained:
+        return write(folder / "deploy" / "configs" / "it.yaml", {"common": common, "policy": policy})
+    content = {
+        "env": policy, "sim": {"dt": 0.002}, "asset": {"mujoco_file": "no.xml"}, "commands": {"gait_frequency": [1, 3]},
+        "init_state": {"default_joint_angles": {"hip": 0.6, "knee": -1.2}}, "normalization": policy["normalization"],
+        "control": policy["control"] | {"stiffness": {"hip": 200, "knee": 50}, "damping": {"hip": 5, "default": 3}},
+    }  # fmt: skip
+    return write(folder / "envs" / "it.yaml", content)
 
 
 def isaac_lab(folder, old="", new=""):
@@ -321,6 +349,34 @@ def test_a_deploy_yaml_may_have_mjlabs_order_missing_motors_and_whole_rows(tmp_p
     assert controller.history.by == "row"
 
 
+@pytest.mark.parametrize("has_env", [True, False])
+def test_the_scan_of_mjlab_is_that_of_its_env_yaml_or_filled_in(tmp_path, has_env, capsys):
+    scan = {"observation_names": "joint_pos,height_scan", "observation_terms_scale": "1.0;0.5;1;1;1;1;1;1,0.2"}
+    more = {f"observation_terms_{name}": ",".join([text] * 2) for name, text in (("history_length", "0"), ("clip", ""))}
+    source = mjlab(tmp_path, width=8 + 6, **scan, **more)
+    if not has_env:
+        with pytest.raises(ValueError, match="scan_x"):
+            imported(source, tmp_path)
+        assert "Fill in scan_x, scan_y" in capsys.readouterr().out
+        return
+    write(tmp_path / "params" / "env.yaml", SCAN)
+    robot, controller = imported(source, tmp_path)
+    joint_pos, points = controller.observation
+    # 0.4 m by 0.2 m in steps of 0.2 m about the trunk.
+    assert (points.x, points.y, points.order) == ((-0.2, 0.0, 0.2), (-0.1, 0.1), "x fastest")
+    assert (points.offset, points.scale, joint_pos.scale[1], robot.physics_dt) == (0.1, 0.2, 0.5, 0.002)
+
+
+@pytest.mark.parametrize("trained", [True, False])
+def test_both_files_of_booster_have_its_observation(tmp_path, trained):
+    robot, controller = imported(booster(tmp_path, trained), tmp_path)
+    assert (robot.stiffness, robot.damping, robot.default_joint_pos) == ((200, 50) * 4, (5, 3) * 4, (0.6, -1.2) * 4)
+    assert (controller.action_scale, controller.action_clip, robot.control_dt) == (0.5, 1.0, 0.02)
+    _, ang_vel, command, clock, _, joint_vel, action = controller.observation
+    assert (ang_vel.scale, command.scale, joint_vel.scale, action.term) == (0.5, (1, 1, 0.5), 0.1, "last_action")
+    assert (clock.order, clock.period_s) == ("cos sin", 0.5)  # 2 Hz, the mean of 1 and 3
+
+
 def test_holosoma_sorts_terms_by_name_and_has_a_phase_of_each_foot(tmp_path):
     robot, controller = imported(holosoma(tmp_path), tmp_path, ' armature="0.01"')
     assert (robot.stiffness, robot.armature, robot.default_joint_pos) == ((40.0,) * 8, (0.02,) * 8, (0.6, -1.2) * 4)
@@ -443,7 +499,9 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (legged_gym, {"old": "control", "control": {"stiffness": {"hip": 20.0}}}, "none of FL_knee"),
         (mjlab, {"joint_damping": "much"}, "run.onnx must be a controller of mjlab"),
         (deployment, {"leg_joint2motor_idx": []}, "leg_joint2motor_idx"),
-        (mjlab, {"observation_names": "base_lin_vel,height_scan"}, "height_scan"),
+        (mjlab, {"observation_names": "base_lin_vel,camera"}, "camera"),
+        (booster, {"num_observations": 36}, "num_observations must be 35"),
+        (booster, {"policy_path": "./models/other.pt"}, "other.pt"),
         (mjlab, {"joint_names": MJLAB["joint_names"].replace("HR_knee", "tail")}, "tail"),
         (isaac_lab, {"old": "joint_pos_rel", "new": "joint_pos"}, "joint_pos,"),
         (isaac_lab, {"old": "JointPositionAction", "new": "JointVelocityAction"}, "JointVelocityAction"),
@@ -454,7 +512,6 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),
         (lambda folder: deploy(folder, ("gait_phase", "height_scan")), {}, "height_scan"),
         (lambda folder: deploy(folder, ("JointPositionAction", "JointVelocityAction")), {}, "JointVelocityAction"),
-        (lambda folder: deploy(folder, ("clip: null, joint", "clip: [[-1, 1]], joint")), {}, "actions.clip"),
         (lambda folder: deploy(folder, (", 7, 5]", ", 7]")), {}, "joint_ids_map"),
         (lambda folder: deploy(folder, ("step_dt:", "gear: 1\nstep_dt:")), {}, "gear"),
         (holosoma, {"experiment_config": None}, "it must see 37 columns"),
