@@ -28,11 +28,10 @@ def _sigmoid(x: float) -> float:
 
 @cache
 def make_torques(width: int, *, num_recurrent: int, activation: int, history: int, decimation: int) -> Any:
-    """The launcher of a kernel that writes the torques of a network, which all drives have in common.
+    """The launcher of a kernel for one network of all drives, with layers of at most ``width`` inputs and units.
 
-    Its layers have at most ``width`` inputs and units; the first ``num_recurrent`` are LSTMs, the others dense, with an
-    ``activation`` (:data:`ACTIVATIONS`) behind all but the last. It knows the errors and velocities of ``history``
-    evaluations, and the torque is held for ``decimation`` physics steps.
+    The first ``num_recurrent`` layers are LSTMs, the others dense, with an ``activation`` behind all but the last.
+    Errors and velocities of ``history`` evaluations are known. A torque is held for ``decimation`` physics steps.
     """
     vector = wp.types.vector(width, float)
 
@@ -40,7 +39,7 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
     def write_torques(
         joint_q: wp.array2d[float],
         joint_qd: wp.array2d[float],
-        weights: wp.array[float],
+        weights: wp.array[wp.vec4],
         sizes: wp.array[int],
         inputs: wp.array[int],
         memory_out: wp.array3d[float],
@@ -48,11 +47,11 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
     ):
         """Grid (num_envs, num_actuators): write torques [N m] in place of the joint targets in ``ctrl``.
 
-        ``weights`` lie layer by layer and row by row: the bias, then those of the inputs. Rows of an LSTM are the gates
-        i, f, g and o of all units, and its inputs end with the hidden state. ``sizes`` are the layers' units,
-        (num_layers,), and ``inputs`` columns of the memory, (num_inputs,). A drive's memory, 0 when an episode begins,
-        is the number of steps, the torque, error [rad] and velocity [rad/s] of each evaluation, the newest first, and
-        hidden and cell state of each LSTM.
+        ``weights`` lie layer by layer, and in it by four rows: their biases, then those of each input. Four rows are
+        the gates i, f, g and o of a unit of an LSTM, whose inputs end with the hidden state, or four units of a dense
+        layer. ``sizes`` are the layers' units, (num_layers,), and ``inputs`` columns of the memory, (num_inputs,). A
+        drive's memory, 0 when an episode begins, is the number of steps, the torque, error [rad] and velocity [rad/s]
+        of each evaluation, the newest first, and hidden and cell state of each LSTM.
         """
         env, k = wp.tid()
         memory = memory_out[env, k]
@@ -72,29 +71,28 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
             row = int(0)
             for layer in range(sizes.shape[0]):
                 size = sizes[layer]
-                gates = int(1)
+                num_fours = (size + 3) // 4
                 if layer < num_recurrent:
-                    gates = 4
+                    num_fours = size
                     for j in range(size):
                         x[count + j] = memory[state + j]
                     count += size
                 y = vector()
-                for unit in range(size):
-                    sums = wp.vec4()
-                    for gate in range(gates):
-                        first = row + (gate * size + unit) * (1 + count)
-                        sums[gate] = weights[first]
-                        for j in range(count):
-                            sums[gate] += weights[first + 1 + j] * x[j]
-                    y[unit] = sums[0]
-                    if gates == 4:
-                        cell = _sigmoid(sums[1]) * memory[state + size + unit] + _sigmoid(sums[0]) * wp.tanh(sums[2])
-                        y[unit] = _sigmoid(sums[3]) * wp.tanh(cell)
-                        memory[state + unit] = y[unit]
-                        memory[state + size + unit] = cell
-                    elif layer + 1 < sizes.shape[0]:
-                        y[unit] = _activate(sums[0], activation)
-                row += gates * size * (1 + count)
+                for k4 in range(num_fours):
+                    four = weights[row]
+                    for j in range(count):
+                        four += weights[row + 1 + j] * x[j]
+                    row += 1 + count
+                    if layer < num_recurrent:
+                        cell = _sigmoid(four[1]) * memory[state + size + k4] + _sigmoid(four[0]) * wp.tanh(four[2])
+                        y[k4] = _sigmoid(four[3]) * wp.tanh(cell)
+                        memory[state + k4] = y[k4]
+                        memory[state + size + k4] = cell
+                    else:
+                        for j in range(4):
+                            y[4 * k4 + j] = four[j]
+                            if layer + 1 < sizes.shape[0]:
+                                y[4 * k4 + j] = _activate(four[j], activation)
                 state += 2 * size
                 x = y
                 count = size

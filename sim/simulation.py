@@ -232,11 +232,12 @@ class Simulation:
     def _build_net(self, cfg: ActuatorNetCfg) -> None:
         net = ActuatorNet(cfg, 0)
         how = {name: getattr(net, name) for name in ("num_recurrent", "activation", "history")}
-        width = max(layer.shape[1] for layer in net.layers)
+        width = max(layer.shape[1] + 3 for layer in net.layers)  # dense units come in fours
         self._write_torques = make_torques(width, decimation=cfg.decimation, **how)
+        rows = [np.pad(layer, ((0, -len(layer) % 4), (0, 0))).reshape(-1, 4, layer.shape[1]) for layer in net.layers]
         num_columns = 2 + 2 * net.history + 2 * sum(net.sizes[: net.num_recurrent])
         self._net = (
-            wp.array(np.concatenate([layer.ravel() for layer in net.layers]), dtype=float),
+            wp.array(np.concatenate([four.swapaxes(1, 2).reshape(-1, 4) for four in rows]), dtype=wp.vec4),
             wp.array(net.sizes, dtype=int),
             wp.array(2 + np.array(net.inputs), dtype=int),
             wp.zeros((*self.solver.mjw_data.ctrl.shape, num_columns), dtype=float),

@@ -18,8 +18,8 @@ _TOLERANCE = 1e-4  # share of the largest torque by which layers may differ from
 class ActuatorNet:
     """A network of ``count`` drives from the beginning of an episode on, in NumPy.
 
-    Its attributes ``layers``, ``sizes``, ``inputs``, ``num_recurrent``, ``activation`` and ``history`` are what
-    :func:`kernels.actuator_net.make_torques` takes, but for columns, which begin two later there.
+    ``layers`` have the rows of :func:`kernels.actuator_net.make_torques`, each with its bias first; ``sizes``,
+    ``num_recurrent``, ``activation`` and ``history`` are those of the kernel, ``inputs`` begin two columns later there.
     """
 
     def __init__(self, cfg: ActuatorNetCfg, count: int) -> None:
@@ -41,6 +41,7 @@ class ActuatorNet:
         for layer, name in zip(columns, lstms, strict=False):
             layer[0] = layer[0] + weights[name.replace("weight_ih", "bias_hh")]
             layer.append(weights[name.replace("weight_ih", "weight_hh")])
+            layer[:] = (np.stack(np.split(part, 4), axis=1).reshape(part.shape) for part in layer)  # unit by unit
         self.num_recurrent = len(lstms)
         self.layers = [*map(np.column_stack, columns)]
         self.sizes = [len(layer[0]) // (4 if k < len(lstms) else 1) for k, layer in enumerate(columns)]
@@ -79,7 +80,8 @@ class ActuatorNet:
         self._former = np.column_stack([error, velocity, self._former[:, :-2]])
         x = self._former[:, self.inputs]
         for layer, (hidden, cell) in zip(self.layers, self._state, strict=False):
-            i, f, g, o = np.split(layer[:, 0] + np.hstack([x, hidden]) @ layer[:, 1:].T, 4, axis=1)
+            gates = layer[:, 0] + np.hstack([x, hidden]) @ layer[:, 1:].T
+            i, f, g, o = np.moveaxis(gates.reshape(*cell.shape, 4), -1, 0)
             cell[:] = expit(f) * cell + expit(i) * np.tanh(g)
             hidden[:] = x = expit(o) * np.tanh(cell)
         activate = getattr(torch.nn.functional, ACTIVATIONS[self.activation])
