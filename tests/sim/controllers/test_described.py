@@ -85,33 +85,25 @@ def test_terms_in_numbers(anymal, seen_by):
 
 @pytest.fixture
 def sensing(anymal):
-    """ANYmal with all senses, and rows of it that stand over the same pose at yaw 90, then -90 degrees."""
-    robot = replace(anymal, senses=("pose", "contacts", "torques"))
-    row = torch.zeros(2, robot.observation_size)
-    row[:, 6:9] = torch.tensor([0.6, 0.0, -0.8])  # gravity of a base pitched by asin(.6)
-    row[:, OBSERVATIONS : OBSERVATIONS + 3] = torch.tensor([2.0, 4.0, 0.6])
-    row[0, [OBSERVATIONS + 3, OBSERVATIONS + 6]] = torch.tensor([0.5**0.5, 0.5**0.5])
-    row[1, [OBSERVATIONS + 3, OBSERVATIONS + 6]] = torch.tensor([0.5**0.5, -(0.5**0.5)])
-    row[:, OBSERVATIONS + 7 : OBSERVATIONS + 11] = torch.tensor([1.0, 0.04, 0.06, 0.0])  # 100, 4, 6 and 0 N
-    row[:, OBSERVATIONS + 11 :] = 0.01 * torch.arange(12)
-    return robot, row
+    """ANYmal with all senses, and its row: pitched by asin(.6), a quaternion of yaw 90 degrees, 100, 4, 6 and 0 N."""
+    pose, contacts = [2.0, 4.0, 0.6, 0.5**0.5, 0.0, 0.0, 0.5**0.5], [1.0, 0.04, 0.06, 0.0]
+    senses = [*pose, *contacts, *(0.01 * np.arange(12))]
+    row = torch.tensor([[*[0.0] * 6, 0.6, 0.0, -0.8, *[0.0] * (OBSERVATIONS - 9), *senses]])
+    return replace(anymal, senses=("pose", "contacts", "torques")), row
 
 
 @pytest.mark.parametrize(
     ("term", "expected"),
     [
         ('"constant", value = [0.3, 2], scale = 2.0', [0.6, 4.0]),
-        ('"constant", value = 0.3', [0.3]),
         ('"heading"', [math.pi / 2]),
-        ('"rpy", axes = "pitch roll"', [math.asin(0.6), 0.0]),
-        ('"rpy", axes = "yaw pitch"', [math.pi / 2, math.asin(0.6)]),
+        ('"rpy", axes = "yaw pitch roll"', [math.pi / 2, math.asin(0.6), 0.0]),
         ('"quat", order = "w x y z"', [0.5**0.5, 0, 0, 0.5**0.5]),
         ('"quat", order = "x y z w"', [0, 0, 0.5**0.5, 0.5**0.5]),
         ('"base_pos"', [2.0, 4.0, 0.6]),
         ('"contacts"', [100.0, 4.0, 6.0, 0.0]),
         ('"contacts", threshold = 5', [1, 0, 1, 0]),
         ('"torques", joints = ["LF_KFE"]', [2.0]),
-        ('"clock", period_s = 0.08', [0, 1]),
         ('"clock", period_s = 0.08, offset = [0, 0.25]', [0, 1, 1, 0]),
         ('"clock", period_s = 0.08, offset = [0, 0.25], order = "cos sin"', [1, 0, 0, 1]),
         ('"clock", period_s = 0.08, offset = [0.5, 0.25, 0], order = "sin"', [0, 1, 0]),
@@ -120,8 +112,6 @@ def sensing(anymal):
 def test_what_a_robot_senses_in_numbers(sensing, seen_by, term, expected):
     seen, _ = seen_by([sensing[1]], f"{{term = {term}}}", robot=sensing[0])
     np.testing.assert_allclose(seen[0, 0], expected, atol=1e-5)
-    if "heading" in term:
-        np.testing.assert_allclose(seen[0, 1], [-math.pi / 2], atol=1e-6)
 
 
 def test_joints_beside_those_that_move_hold_or_wander(anymal, seen_by):
@@ -132,11 +122,9 @@ def test_joints_beside_those_that_move_hold_or_wander(anymal, seen_by):
     _, actions = seen_by(rows, '{term = "gravity"}', *lines)
     targets = (actions * anymal.action_scale).numpy() + anymal.default_joint_pos
     expected = np.tile(anymal.default_joint_pos, (41, 1))
-    expected[:, 2] = -1.0
-    pose = 100.0 * np.arange(1, 13) @ anymal.default_joint_pos
-    periods = pose + np.arange(41) / 40
-    expected[:, 11] = 1.5 + 0.1 * np.sin(2 * math.pi * periods)
-    expected[:, 6] += 0.1 * np.sin(2 * math.pi * (periods + 0.618))
+    expected[:, [2, 11]] = -1.0, 1.5
+    periods = 100.0 * np.arange(1, 13) @ anymal.default_joint_pos + np.arange(41) / 40
+    expected[:, [11, 6]] += 0.1 * np.sin(2 * math.pi * (periods[:, None] + [0.0, 0.618]))
     np.testing.assert_allclose(targets[:, 0], expected, atol=1e-3)
     np.testing.assert_allclose(targets[:31, 1], targets[10:, 0], atol=1e-3)
 

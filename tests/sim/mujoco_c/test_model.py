@@ -126,9 +126,8 @@ def test_a_robot_senses_the_same_in_both(anymal):
     for ours_now, plain_now in zip(ours, plain, strict=True):
         for name, tolerance in (("base_pos", 1e-5), ("quat", 1e-5), ("contacts", 0.1), ("torques", 0.01)):
             np.testing.assert_allclose(getattr(ours_now, name), getattr(plain_now, name), atol=tolerance)
-    assert not plain[0].contacts.any() and not plain[0].torques.any()
+    assert not plain[0].contacts.any() and not plain[0].torques.any() and float(plain[9].torques.abs().max()) > 20.0
     assert 300.0 < float(plain[9].contacts.sum(dim=1).mean()) < 800.0  # 52 kg weigh 511 N
-    assert plain[9].torques.shape == (EPISODES, 12) and float(plain[9].torques.abs().max()) > 20.0
 
 
 SPEEDS = [0.0, 5.0, 10.0, 13.0, 25.0, -5.0]  # [rad/s]
