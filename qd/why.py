@@ -29,7 +29,6 @@ _LEAST_GAIN = 0.03  # of the score for which a change is named
 _WEIGHTS = {"roll_pitch_rate": 0.2, "tilt": 2.0, "action_rate": 0.4, "action": 0.05, "power": 0.4}
 """Chosen on errors planted into Go2 (robot_lab), B2, Go1 and ANYmal, on no other robot."""
 _FACTORS = (0.05, 0.25, 0.5, 2.0, 4.0, 20.0, -1.0)
-_COMMAND_FACTORS = ((2.0, 2.0, 0.25), (0.5, 0.5, 4.0))
 _ALL_PAIRS = 16  # joints up to which all pairs of them are swapped
 _LIMB = re.compile(r"(?i)(?<![a-z])(fl|fr|rl|rr|hl|hr|lf|rf|lh|rh|left|right|l|r)(?![a-z])")
 _GAINS = ("stiffness", "damping", "effort_limit", "armature")
@@ -80,8 +79,11 @@ def _scale_term(cfg: ControllerCfg, k: int, factors: Any) -> ControllerCfg:
 def _change_terms(cfg: ControllerCfg) -> Iterator[tuple[str, ControllerCfg]]:
     """Scales, signs and order of terms, and of the history."""
     for k, term in enumerate(cfg.observation):
-        factors = [*_FACTORS, *_COMMAND_FACTORS] if term.term == "command" else _FACTORS
-        for factor in factors if term.term not in ("gravity", "clock", "constant") else ():
+        factors: list[Any] = [*_FACTORS] if term.term not in ("gravity", "clock", "constant") else []
+        if term.term == "command":  # as legged_gym scales it
+            turns = [name == "yaw_rate" for name in (term.order or "v_x v_y yaw_rate").split()]
+            factors += [tuple(np.where(turns, *pair).tolist()) for pair in ((0.25, 2.0), (4.0, 0.5))]
+        for factor in factors:
             yield f"{term.term} x {factor}", _scale_term(cfg, k, factor)
         if term.term in ("lin_vel", "ang_vel", "gravity"):
             for signs in itertools.product((1.0, -1.0), repeat=3):
@@ -198,11 +200,11 @@ def explain_walk(robot: RobotCfg, policy: str, compute: Compute) -> None:
     if weights is None or not weights.is_file():
         print(f"What is wrong can be found of a controller.toml or of weights, got {policy}.")
         return
-    base = Variant(controller=read_controller(path) if is_data else _describe_row(robot), robot=robot)
+    base = Variant(controller=read_controller(path) if is_data else describe_row(robot), robot=robot)
     print("\n".join(describe_ranked(base, rank_changes(base, weights, device=compute.device))), flush=True)
 
 
-def _describe_row(robot: RobotCfg) -> ControllerCfg:
+def describe_row(robot: RobotCfg) -> ControllerCfg:
     """The description of weights that see the robot's row (docs/controllers.md)."""
     scales = {"lin_vel": 2.0, "ang_vel": 0.25, "gravity": 1.0, "command": (2.0, 2.0, 0.25), "joint_pos": 1.0}
     scales |= {"joint_vel": 0.05, "last_action": 1.0}
