@@ -47,8 +47,7 @@ class _Ports:
         if not rest or not self.columns or None in sum(self.states.values(), ()):
             got = f"{', '.join(port.name for port in inputs)} and {', '.join(names)}"
             raise ValueError(f"it must have an input and an output, and states X_in and X_out, got {got}")
-        shapes = self.columns.values()
-        width = None if None in sum(shapes, ()) else sum(map(math.prod, shapes))
+        width = None if None in sum(self.columns.values(), ()) else sum(map(math.prod, self.columns.values()))
         count = self._read_shape(actions[0])[-1]
         self.sizes: tuple[Any, Any] = sizes or (width, count)
         if None in self.sizes or (width is None and len(self.columns) > 1):
@@ -62,11 +61,9 @@ class _Ports:
         self.ignored = [name for name in names if name not in self.outputs]
 
     def _read_shape(self, port: Any, axes: Sequence[int] = (0,)) -> tuple[Any, ...]:
-        """The shape of one robot's tensor, None where it is free; robots stand along one of the axes."""
+        """The shape of one robot's tensor, None where it is free; robots stand along one of the axes, if free."""
         shape = [size if isinstance(size, int) else None for size in port.shape or (None, None)]  # if it is unknown
-        axes = sorted(
-            axes, key=lambda axis: shape[axis : axis + 1] != [None]
-        )  # layers, batch, size; or the batch first
+        axes = sorted(axes, key=lambda axis: shape[axis : axis + 1] != [None])
         axis = next((axis for axis in axes if shape[axis : axis + 1] in ([None], [1])), None)
         if port.type != "tensor(float)" or len(shape) < 2 or axis is None:
             must = "float32 of shape (batch, size) with a batch that is free or 1"
@@ -165,42 +162,20 @@ class OnnxLayers(torch.nn.Module):
     def run(self, rows: torch.Tensor, states: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """:meth:`OnnxPolicy.run` of the same graph."""
         inputs = self._ports.feed(rows, states)
-        if self._each:
-            return torch.vmap(lambda values: self._compute(values, torch.unsqueeze, torch.squeeze))(inputs)
-        return self._compute(
-            inputs, lambda value, axis: value.movedim(0, axis), lambda value, axis: value.movedim(axis, 0)
-        )
+        return torch.vmap(self._compute)(inputs) if self._each else self._compute(inputs)
 
-    def _compute(self, inputs: dict[str, Any], enter: Callable[..., Any], leave: Callable[..., Any]) -> list[Any]:
-        """The graph's outputs; ``enter`` and ``leave`` give inputs, and take from outputs, the axis of robots."""
+    def _compute(self, inputs: dict[str, torch.Tensor]) -> list[torch.Tensor]:
+        """The outputs that are needed; with ``each`` of one robot, whose axis goes in and comes out."""
+        ports, each = self._ports, self._each
         values: dict[Any, Any] = dict(zip(self._names, self.weights, strict=True))
-        values |= {name: enter(value, self._ports.axes[name]) for name, value in inputs.items()}
+        values |= {name: value.unsqueeze(ports.axes[name]) if each else value for name, value in inputs.items()}
         for layer, arguments, outputs, attributes in self._nodes:
             value = layer(*(values[name] if isinstance(name, str) else name for name in arguments), **attributes)
             values |= zip(outputs, value if isinstance(value, tuple) else [value], strict=True)
-        return [leave(values[name], axis) for name, axis in self._ports.outputs.items()]
+        return [values[name].squeeze(axis) if each else values[name] for name, axis in ports.outputs.items()]
 
 
-def _slice(value: torch.Tensor, starts: Any, ends: Any, axes: Any = None, steps: Any = None) -> torch.Tensor:
-    index = [slice(None)] * value.ndim
-    for k, axis in enumerate(axes or range(len(starts))):
-        index[axis] = slice(starts[k], ends[k], steps[k] if steps else 1)
-    return value[tuple(index)]
-
-
-def _gather(value: torch.Tensor, index: torch.Tensor, *, axis: int = 0) -> torch.Tensor:
-    axis %= value.ndim
-    rows = value.index_select(axis, index.flatten())
-    return rows.reshape(*value.shape[:axis], *index.shape, *value.shape[axis + 1 :])
-
-
-def _unsqueeze(value: torch.Tensor, axes: Any) -> torch.Tensor:
-    for axis in sorted(axis % (value.ndim + len(axes)) for axis in axes):
-        value = value.unsqueeze(axis)
-    return value
-
-
-_OF_NUMBERS = ("Clip", "ReduceMean", "Reshape", "Slice", "Split", "Squeeze", "Unsqueeze")
+_OF_NUMBERS = ("Clip", "ReduceMean", "Reshape", "Slice", "Split", "Unsqueeze")
 _LAYERS: dict[str, Callable[..., Any]] = {
     **{name: getattr(torch, name.lower()) for name in (*_BINARY, *_UNARY)},
     **{name: getattr(functional, name.lower()) for name in ("Elu", "Selu", "Relu", "Softplus")},
@@ -209,19 +184,16 @@ _LAYERS: dict[str, Callable[..., Any]] = {
     "Max": lambda *values: functools.reduce(torch.maximum, values),
     "Min": lambda *values: functools.reduce(torch.minimum, values),
     "Clip": lambda value, min=None, max=None: value.clamp(min, max),
-    "Softmax": lambda value, *, axis=-1: value.softmax(axis),
     "Split": lambda value, sizes=None, *, num_outputs, axis=0, split=None: (
         value.split(sizes or split, axis) if sizes or split else value.chunk(num_outputs, axis)
     ),
     "Concat": lambda *values, axis: torch.cat(values, axis),
-    "Gather": _gather,
+    "Gather": lambda value, index, *, axis=0: value.index_select(axis, index),
     "GatherND": lambda value, index, **attributes: value[index[None].unbind(-1)][0],
     "Reshape": lambda value, shape, **attributes: value.reshape(shape),
-    "Flatten": lambda value, *, axis=1: value.flatten(axis),
     "Transpose": lambda value, *, perm: value.permute(perm),
-    "Slice": _slice,
-    "Squeeze": lambda value, axes: value.squeeze(axes),
-    "Unsqueeze": _unsqueeze,
+    "Slice": lambda value, start, end, axis, step=(1,): torch.ops.aten.slice(value, *axis, *start, *end, *step),
+    "Unsqueeze": lambda value, axis: value.unsqueeze(*axis),
     "ReduceMean": lambda value, axes=(), *, keepdims=1, **attributes: value.mean(axes, bool(keepdims)),
     "LayerNormalization": lambda value, weight, bias=None, *, axis=-1, epsilon=1e-5, **attributes: (
         functional.layer_norm(value, value.shape[axis:], weight, bias, epsilon)
@@ -258,9 +230,7 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
     except Exception as error:  # protobuf and onnxruntime have errors of their own, without a base
         raise ValueError(f"policy '{path}' is no ONNX file of this robot: {error}: export it anew") from None
     if ports.ignored:
-        warnings.warn(
-            f"policy '{path}' returns more than actions: {', '.join(ports.ignored)} are ignored", stacklevel=2
-        )
+        warnings.warn(f"policy '{path}' returns more than actions: {', '.join(ports.ignored)}: ignored", stacklevel=2)
     if isinstance(network, OnnxPolicy):
         if target.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
             what = "runs on the CPU, since this onnxruntime has no CUDA that works"

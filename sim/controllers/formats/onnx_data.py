@@ -23,16 +23,14 @@ def read_onnx(path: Path) -> tuple[Any, bytes]:
     file = _check_data_file(path, outside)
     if file is None:
         return model, path.read_bytes()
-    if not file.is_file():
-        raise ValueError(f"{file} with {len(outside)} of its tensors is not there: put it beside it")
     data = file.read_bytes()
     for tensor in outside:
         fields = {field.key: field.value for field in tensor.external_data}
         size = int(np.prod(tensor.dims)) * helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
         start, length = int(fields.get("offset", 0)), int(fields.get("length", size))
         if length != size or not 0 <= start <= len(data) - size:
-            got = f"{file} of {len(data)} bytes with {length} from {start} on"
-            raise ValueError(f"'{tensor.name}' has {size} bytes, got {got}: copy both files of one export")
+            got = f"{length} from {start} on in {file} of {len(data)}"
+            raise ValueError(f"'{tensor.name}' must have {size} bytes, got {got}: copy both files of one export")
         tensor.raw_data = data[start : start + size]
         tensor.data_location = TensorProto.DEFAULT
         del tensor.external_data[:]
@@ -56,13 +54,10 @@ def _read_graph(path: Path) -> tuple[Any, list[Any]]:
 def _check_data_file(path: Path, outside: list[Any]) -> Path | None:
     """The one file beside ``path`` that tensors name."""
     names = {field.value for tensor in outside for field in tensor.external_data if field.key == "location"}
-    if not outside:
-        return None
     file = path.parent / next(iter(names), "")
-    if len(names) != 1 or file.name not in names or file.resolve().parent != path.parent.resolve():
-        what = f"it keeps {len(outside)} of its tensors ('{outside[0].name}' first) in {', '.join(sorted(names))}"
-        raise ValueError(f"{what}: expected one file beside it")
-    return file
+    if outside and ({file.name} != names or file.resolve().parent != path.parent.resolve()):
+        raise ValueError(f"it must keep its tensors in one file beside it, got {len(outside)} in {', '.join(names)}")
+    return file if outside else None
 
 
 def _tensors(message: Any) -> Iterator[Any]:
