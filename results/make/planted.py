@@ -28,7 +28,7 @@ ERRORS = {
     "one sign": r"sign of the action|direction of",
     "two joints swapped": r"order of \S+_\S+ and \S+_\S+$",
     "action scale": r"action_scale x 0\.5$",
-    "gyro frame": r"signs of .* of ang_vel$",
+    "gyro frame": r"signs of .. of ang_vel$",
     "order of history": r"history\.(newest|by)",
     "default pose": r"default$",
     "position gain": r"stiffness x 2\.0$",
