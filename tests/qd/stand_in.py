@@ -60,7 +60,7 @@ def evaluate(genes: np.ndarray, seeds: np.ndarray, replicas: int = 4) -> Rollout
     """Penalties that differ between terrains by their genes and between replicas by their seed; none on heights."""
     if genes.ndim == 3:  # level ground, which is crossed at 0.7 m/s
         result = make_result(np.zeros((len(genes), replicas, len(PENALTIES))))
-        end = np.broadcast_to(np.float32([12.5, 4.0, 0.3]), result.final_position.shape)
+        end = np.broadcast_to(np.array([12.5, 4.0, 0.3], np.float32), result.final_position.shape)
         return replace(result, final_position=end.copy())
     genes = np.asarray(genes, dtype=np.float64)
     hardness = np.stack([np.abs(genes[:, k::6]).mean(axis=1) for k in range(6)], axis=1)
