@@ -135,24 +135,19 @@ def _half_label(dose: dict[str, Any], element: str) -> str:
     return f"of over {100 * _RISES[-1]:.0f} cm" if is_over else f"of less than {100 * _RISES[0]:.0f} cm"
 
 
-def find_fitting_height(crosser: Crosser, policy: str, *, room: int = 0) -> tuple[float, float]:
+def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
     """The largest height [m] at which a controller crosses 80 % of hard-random terrains, and the share at that height.
 
     Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
-    ground, fails everywhere on it, and a search says nothing. The least height is 2 cm. All heights are tried at once
-    on a GPU, else one after the other. ``room`` is as :meth:`qd.workers.crosser.Crosser.cross` takes it.
+    ground, fails everywhere on it, and a search says nothing. The least height is 2 cm.
     """
     shares = dict[float, float]()
 
     def fails(height: float) -> bool:
-        if height not in shares:
-            heights = _HEIGHTS if crosser.compute.on_gpu else (height,)
-            terrains = Terrains.join([_draw_terrains(_TRIED, tried) for tried in heights])
-            label = f"hard-random terrains up to {heights[-1]:g} m"
-            result = crosser.cross(policy, terrains, replicas=1, label=label, room=room)
-            refuse_all_invalid(result)
-            counts = [values.reshape(len(heights), -1).sum(axis=1) for values in (result.reached_goal, ~result.invalid)]
-            shares.update(zip(heights, (counts[0] / np.maximum(counts[1], 1)).tolist(), strict=True))
+        label = f"hard-random terrains of height {height:g} m"
+        result = crosser.cross(policy, _draw_terrains(_TRIED, height), replicas=1, label=label)
+        refuse_all_invalid(result)
+        shares[height] = float(result.reached_goal[~result.invalid].mean())
         print(f"Height {height:g} m: {shares[height]:.0%} of episodes reach the goal.", flush=True)
         return shares[height] < _CROSSED
 
@@ -184,8 +179,7 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     prepare_output(out)
     results: list[RolloutResult] = []
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
-        room = terrains if replicas == 1 else 0
-        height = None if robot.settings_file is None else find_fitting_height(crosser, policy, room=room)[0]
+        height = None if robot.settings_file is None else find_fitting_height(crosser, policy)[0]
         drawn = _draw_terrains(_MAX_ROUNDS * terrains, height)
         for first in range(0, len(drawn), terrains):
             label = f"hard-random terrains from {first + 1:,}"

@@ -31,9 +31,9 @@ _EPISODES = 20
 _MIN_SPEED = 0.15  # a slower controller does not walk, whatever its time [m/s]
 _SPARE_TIME = 1.25  # a crossing gets so many times what it takes on level ground
 _DISTANCE = math.dist(CrossingCfg.start, CrossingCfg.goal)
+_KEYS = ("episodes", "goal", "speed", "height")
 _ENGINES: dict[str, tuple[Engine, str]] = {"searched": ("search", ""), "mujoco_c": ("mujoco_c_search", "_mujoco_c")}
 Walks = dict[str, dict[str, float]]
-"""``episodes``, ``goal``, ``speed`` and ``height`` by simulator, ``searched`` or ``mujoco_c``, as :func:`walk` says."""
 
 
 def walk(crosser: Crosser, policy: str, seed: int = 0, names: Sequence[str] = tuple(_ENGINES)) -> Walks:
@@ -65,22 +65,14 @@ def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = Fals
     file, identity = robot.home / f"{crosser_name(robot, policy)}.level.json", controller_identity(robot, policy)
     is_stored = robot.settings_file is not None and identity["policy_sha256"] is not None
     stored: dict[str, Any] = read_json(file) if is_stored and file.exists() else {}
-    if any(stored.get(key) != value for key, value in identity.items()):
-        stored = {**identity}
+    stored = stored if identity.items() <= stored.items() else {**identity}
     for name in names:
-        if f"flat_speed{_ENGINES[name][1]}" not in stored:
+        if f"flat_episodes{_ENGINES[name][1]}" not in stored:
             (numbers,) = walk(crosser, policy, names=[name]).values()
             stored |= {f"flat_{key}{_ENGINES[name][1]}": value for key, value in numbers.items()}
             if is_stored:
                 write_atomically(file, to_json({**crosser.compute.origin(0), **stored}))
-    keys = ("episodes", "goal", "speed", "height")
-    return {name: {key: stored[f"flat_{key}{_ENGINES[name][1]}"] for key in keys} for name in names}
-
-
-def _walk_here(robot: RobotCfg, policy: str, compute: Compute) -> dict[str, float]:
-    """The numbers of :func:`walk` without MuJoCo C."""
-    with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
-        return measure_level_ground(crosser, policy)["searched"]
+    return {name: {key: stored[f"flat_{key}{_ENGINES[name][1]}"] for key in _KEYS} for name in names}
 
 
 def give_time(robot: RobotCfg, policy: str, compute: Compute) -> RobotCfg:
@@ -92,7 +84,8 @@ def give_time(robot: RobotCfg, policy: str, compute: Compute) -> RobotCfg:
     file = robot.settings_file
     if file is None or file.suffix != ".toml" or "max_duration_s" in read_toml(file):
         return robot
-    speed = _walk_here(robot, policy, compute)["speed"]
+    with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
+        speed = measure_level_ground(crosser, policy)["searched"]["speed"]
     needed = math.ceil(10.0 * _SPARE_TIME * _DISTANCE / max(speed, _MIN_SPEED)) / 10.0
     if speed < _MIN_SPEED or needed <= robot.max_duration_s:
         return robot
@@ -107,7 +100,8 @@ def report_level_ground(robot: RobotCfg, policy: str | None, compute: Compute, *
     if robot.settings_file is None:
         return
     policy = policy or str(robot.policy_file)
-    walked = _walk_here(robot, policy, compute)
+    with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
+        walked = measure_level_ground(crosser, policy)["searched"]
     goals = round(walked["goal"] * walked["episodes"])
     speeds = f"in {robot.max_duration_s:g} s, at {walked['speed']:.3f} of {robot.speed:g} m/s"
     text = f"{robot.name} on level ground: {goals} of {_EPISODES} reach the goal {speeds}"

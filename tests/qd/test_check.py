@@ -146,20 +146,16 @@ def test_a_penalty_that_never_occurs_is_refused_once_all_scales_are_written(scal
     assert list(json.loads(scales.read_text())["scales"]) == list(stand_in.PENALTIES[1:])
 
 
-@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
 @pytest.mark.parametrize(("crossed_up_to", "expected"), [(0.30, 0.25), (0.11, 0.1), (0.04, 0.04), (0.001, 0.02)])
-def test_terrain_is_as_high_as_the_controller_crosses_it_mostly(crossed_up_to, expected, device):
+def test_terrain_is_as_high_as_the_controller_crosses_it_mostly(crossed_up_to, expected):
     heights = []
 
     class Crosses:
-        compute = Compute(device)
-
-        def cross(self, policy, terrains, *, replicas, **_):
-            heights.append(0.25 * np.abs(terrains.genes[:, 7]))  # of the first bump
+        def cross(self, policy, terrains, *, replicas, label):
+            heights.append(0.25 * np.abs(terrains.genes[:, 7]).max())  # of the first bump
             result = stand_in.evaluate(terrains.genes, terrains.seeds, replicas)
-            outcome = np.where(heights[-1] <= crossed_up_to + 1e-6, Outcome.GOAL, Outcome.TIME_OUT).astype(np.uint8)
-            return replace(result, outcome=outcome[:, None])
+            return failing(0.0 if heights[-1] <= crossed_up_to + 1e-6 else 0.5)(result)
 
     height, share = find_fitting_height(Crosses(), "policy.pt")
     assert height == expected and (share >= 0.8) == (height <= crossed_up_to)
-    assert heights[0].max() == 0.25 and (len(heights) <= 5 if device == "cpu" else len(heights[0]) == 1100)
+    assert heights[0] == 0.25 and len(heights) <= 5
