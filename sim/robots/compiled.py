@@ -43,15 +43,11 @@ _ZERO_ATTRIBUTES = {
 }
 """Attributes of elements that must be 0."""
 _NEWTON_SOLVERS = {
-    "<equality> connect": "SolverKamino, closed loops",
-    "<equality> weld": "SolverKamino, closed loops",
+    "<equality> (connect|weld)": "SolverKamino, closed loops",
     "only joint of its body": "SolverMuJoCo, D6 joints",
-    "a ball joint": "SolverMuJoCo, ball joints",
-    "a tendon": "SolverMuJoCo, tendons",
+    "a (ball joint|tendon)": "SolverMuJoCo, ball joints and tendons",
     "a <velocity> drive": "SolverMuJoCo, targets of velocity",
-    "a flexible body": "SolverVBD, soft bodies",
-}
-"""What of Newton's solvers can do what is refused, by their own documentation."""
+}  # by their own documentation
 
 
 def joint_names(model: Any) -> tuple[str, ...]:
@@ -258,8 +254,8 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
         problems.append(f"qpos of the keyframe home must be {model.nq} numbers, got {len(home)}")
     if problems:
         text = "; ".join(f"{model_file}: {_quote_urdf(problem, files)}" for problem in problems)
-        solvers = dict.fromkeys(solver for part, solver in _NEWTON_SOLVERS.items() if part in text)
-        raise ValueError(f"{text} (Newton could, but not here: {'; '.join(solvers)})" if solvers else text)
+        solvers = "; ".join(solver for pattern, solver in _NEWTON_SOLVERS.items() if re.search(pattern, text))
+        raise ValueError(text + f" (Newton could, but not here: {solvers})" * bool(solvers))
     return RobotFile(spec=spec, model=model, home=home[7:] or None, is_urdf=files.is_urdf)
 
 

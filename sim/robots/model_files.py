@@ -30,10 +30,9 @@ class ModelFiles:
 
 
 def find_model(name: str | Path, folder: Path = Path()) -> Path:
-    """The file that ``name`` gives of a model: a path below ``folder``, or that of a robot of MuJoCo Menagerie.
+    """The file of a model: a path below ``folder``, or ``menagerie:unitree_go2``, a robot of MuJoCo Menagerie.
 
-    ``menagerie:unitree_go2`` is the robot's default model; ``menagerie:unitree_go2/go2_mjx`` is another of its models.
-    Their package downloads a robot once.
+    ``menagerie:unitree_go2/go2_mjx`` is another of its models. The menagerie's package downloads a robot once.
     """
     robot_name, _, model_name = str(name).removeprefix(MENAGERIE).partition("/")
     if not str(name).startswith(MENAGERIE):
@@ -63,13 +62,19 @@ def find_above(name: str, folder: Path) -> Path | None:
 
 def find_robot_of_scene(model_file: Path) -> Path:
     """The file that a scene includes for its robot; ``model_file`` itself if it has bodies, or is no MJCF."""
-    try:
-        root = ET.parse(model_file).getroot()
-    except (ET.ParseError, OSError, ValueError):
-        return model_file  # who reads it says why
+    root = _parse_xml(model_file)
     names = [element.get("file", "") for element in root.findall("include")]
     is_scene = root.tag == "mujoco" and len(names) == 1 and root.find("worldbody/body") is None
     return model_file.parent / names[0] if is_scene else model_file
+
+
+def _parse_xml(model_file: Path) -> ET.Element:
+    try:
+        return ET.parse(model_file).getroot()
+    except FileNotFoundError:
+        raise ValueError(f"model file expected at {model_file}, no such file") from None
+    except (ET.ParseError, OSError, ValueError) as error:
+        raise ValueError(f"{model_file} cannot be read as XML: {error}") from None
 
 
 def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
@@ -77,12 +82,7 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
 
     With ``visuals`` a URDF keeps the visuals of its links that are primitives or existing meshes of a known format.
     """
-    try:
-        root = ET.parse(model_file).getroot()
-    except FileNotFoundError:
-        raise ValueError(f"model file expected at {model_file}, no such file") from None
-    except (ET.ParseError, OSError, ValueError) as error:
-        raise ValueError(f"{model_file} cannot be read as XML: {error}") from None
+    root = _parse_xml(model_file)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
     visual_elements = [(parent, visual) for parent in root.iter() for visual in parent.findall("visual")]

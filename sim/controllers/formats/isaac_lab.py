@@ -51,10 +51,8 @@ class IsaacLab:
         source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
         _read_actuators(articulation["actuators"], source)
         source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
-        commands = [command for command in (env.get("commands") or {}).values() if isinstance(command, dict)]
-        source.set_speed(
-            next((ranges for command in commands if "lin_vel_x" in (ranges := command.get("ranges") or {})), {})
-        )
+        for command in (env.get("commands") or {}).values():
+            source.set_speed((command.get("ranges") or {}) if isinstance(command, dict) else {})
         joint_order = read_action(env, path, source, agent.get("clip_actions"))
         observation_groups = agent.get("obs_groups") or {}
         rows, lengths = [], []
@@ -136,9 +134,9 @@ def _order_joints(env: dict[str, Any], path: Path, source: Source) -> tuple[list
         return ordering, ""
     if ordering not in ("physx", "mjwarp"):
         raise ValueError(f"{source.file}: joint_ordering must be physx, mjwarp or a list of joints, got {ordering}")
-    if ordering == "mjwarp":
-        return list(source.joints), "that of the model, as Newton orders joints; IO_descriptors.yaml would say it"
-    return source.sort_breadth_first(), "breadth first, as PhysX orders joints; IO_descriptors.yaml would say it"
+    joints = source.sort_breadth_first() if ordering == "physx" else list(source.joints)
+    kind = "breadth first, as PhysX" if ordering == "physx" else "that of the model, as Newton"
+    return joints, f"{kind} orders joints; IO_descriptors.yaml would say it"
 
 
 def read_action(env: dict[str, Any], path: Path, source: Source, limit: float | None) -> list[str]:

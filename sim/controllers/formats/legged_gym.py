@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from sim.controllers.formats.rsl_rl import read_activation
-from sim.controllers.formats.source import BLIND_TERMS, CLOCK_PERIOD, Source, find_checkpoint, make_term
+from sim.controllers.formats.source import BLIND_TERMS, CLOCK_PERIOD, Source, find_checkpoint, find_weights, make_term
 from sim.files.settings import YAML_SUFFIXES, read_yaml
 
-_CONTROL = ("control_type", "stiffness", "damping", "action_scale", "decimation")
+_CONTROL = ("control_type", "use_actuator_network", "actuator_net_file", "stiffness", "damping")
 _HIM_TERMS = ("command", "ang_vel", "gravity", "joint_pos", "joint_vel", "last_action")
 
 
@@ -25,10 +25,13 @@ class LeggedGym:
         cfg = read_yaml(path)
         control, normalization, terrain = cfg["control"], cfg["normalization"], cfg.get("terrain") or {}
         source.find_model_file(cfg["asset"]["file"])
-        source.refuse_unknown(control, _CONTROL)
+        source.refuse_unknown(control, (*_CONTROL, "action_scale", "decimation"))
         if control.get("control_type", "P") != "P":
             raise ValueError(f"control_type must be P, joint positions, got {control['control_type']}")
-        for name in ("stiffness", "damping"):
+        has_net = control.get("use_actuator_network")
+        if has_net:
+            source.set(actuator_net={"file": str(find_weights(path.parent, control["actuator_net_file"]).resolve())})
+        for name in () if has_net else ("stiffness", "damping"):
             gains = {joint: [gain for key, gain in control[name].items() if key in joint] for joint in source.joints}
             if without := [joint for joint, matches in gains.items() if not matches]:
                 raise ValueError(f"{name} must have a part of every joint's name, got none of {', '.join(without)}")
@@ -45,26 +48,21 @@ class LeggedGym:
         factors = {"joint_pos": scales["dof_pos"], "joint_vel": scales["dof_vel"], "ang_vel": scales["ang_vel"]}
         factors |= {"lin_vel": scales["lin_vel"], "command": [scales["lin_vel"]] * 2 + [scales["ang_vel"]]}
         grid = {axis: terrain.get(f"measured_points_{axis}") or [] for axis in "xy"}
-        clock = make_term("clock", period_s=CLOCK_PERIOD)
-        scan = make_term("scan", scales.get("height_measurements"), **grid, order="y fastest", offset=0.5, clip=1.0)
-        layouts = {
-            blind: (BLIND_TERMS, [], "unitree_rl_gym"),
-            blind + 2: (BLIND_TERMS, [clock], "unitree_rl_gym, with the period of its clock"),
-            blind + 3: (("lin_vel", *BLIND_TERMS), [], "legged_gym"),
-            blind + 3 + len(grid["x"]) * len(grid["y"]): (
-                ("lin_vel", *BLIND_TERMS),
-                [scan] * bool(grid["x"]),
-                "legged_gym",
-            ),
+        factors["scan"] = scales.get("height_measurements")
+        fields = {
+            "scan": {**grid, "order": "y fastest", "offset": 0.5, "clip": 1.0},
+            "clock": {"period_s": CLOCK_PERIOD},
         }
+        with_velocity = ("lin_vel", *BLIND_TERMS)
+        layouts = {0: BLIND_TERMS, 2: (*BLIND_TERMS, "clock")}
+        layouts |= {3 + len(grid["x"]) * len(grid["y"]): (*with_velocity, "scan"), 3: with_velocity}
+        names = _HIM_TERMS if row == blind else layouts.get(width - blind, ())
         if row == blind:
-            layouts[width] = (_HIM_TERMS, [], "HIMLoco")
-            history = {"length": width // row, "newest": "first", "by": "row", "fill": "zeros"}
-            source.set(history=history, reason="as in HIMLoco")
-        names, others, author = layouts.get(width, ((), [], ""))
-        terms = [make_term(name, factors.get(name)) for name in names] + others
+            source.set(history={"length": width // row, "newest": "first", "by": "row", "fill": "zeros"})
+        terms = [make_term(name, factors.get(name), **fields.get(name, {})) for name in names]
+        usual = f"as legged_gym, unitree_rl_gym or HIMLoco order {width} columns"
         gap = f"its {width} columns in its order, with scale; no usual observation is so wide"
-        source.set(observation=terms or None, reason=f"the order of {author}, by its {width} columns" if terms else gap)
+        source.set(observation=terms or None, reason=usual if terms else gap)
         weights = find_checkpoint(path.parent, "policy*.pt")
         if weights.name.startswith("model_"):
             source.set(activation=read_activation(cfg) or "elu", reason="elu is usual in legged_gym")

@@ -46,11 +46,10 @@ MJLAB = {
     "command_names": "twist",
 }  # fmt: skip
 LEGGED_GYM = {
-    "env": {"num_observations": 36}, "sim": {"dt": 0.005}, "asset": {"file": "{LEGGED_GYM_ROOT_DIR}/dog.urdf"},
+    "asset": {"file": "{LEGGED_GYM_ROOT_DIR}/dog.urdf"}, "sim": {"dt": 0.005},
     "init_state": {"default_joint_angles": dict(zip(RIGHT_FIRST, POSE, strict=True))},
-    "control": {"control_type": "P", "stiffness": {"hip": 20.0, "knee": 30.0, "HR_knee": 35.0},
-                "damping": {"hip": 0.5, "knee": 0.6}, "action_scale": 0.25, "decimation": 4},
-    "commands": {"ranges": {"lin_vel_x": [-0.5, 0.5]}},
+    "control": {"stiffness": {"hip": 20.0, "knee": 30.0, "HR_knee": 35.0}, "damping": {"_": 0.5}, "action_scale": 0.25,
+                "decimation": 4},
     "terrain": {"measured_points_x": [-0.1, 0.1], "measured_points_y": [0.0]},
     "normalization": {"clip_observations": 100.0, "clip_actions": 10.0, "obs_scales": {
         "lin_vel": 2.0, "ang_vel": 0.25, "dof_pos": 1.0, "dof_vel": 0.05, "height_measurements": 5.0}},
@@ -163,12 +162,10 @@ def deployment(folder, **changes):
     return write(folder / "dog.yaml", DEPLOYMENT | changes)
 
 
-def legged_gym(folder, width=36, old=None, row=None, **changes):
+def legged_gym(folder, width=36, row=None, **control):
     write(folder / "policy_1.pt", width)
-    env = {"env": {"num_observations": width, "num_one_step_observations": row}}
-    if old:
-        changes[old] = LEGGED_GYM[old] | changes[old]
-    return write(folder / "cfg.json", json.dumps(LEGGED_GYM | env | changes))
+    env = {"num_observations": width, "num_one_step_observations": row}
+    return write(folder / "cfg.json", json.dumps(LEGGED_GYM | {"env": env, "control": LEGGED_GYM["control"] | control}))
 
 
 def mjlab(folder, width=42, **changes):
@@ -289,29 +286,27 @@ def test_weights_and_the_model_of_a_deployment_may_be_in_folders_above(tmp_path)
         import_controller(source, None, tmp_path / "mine" / "cat")
 
 
-HIM = ["command", "ang_vel", "gravity", "joint_pos", "joint_vel", "last_action"]
+BLIND = BLIND_WITH_CLOCK[:-1]
 
 
 @pytest.mark.parametrize(
     ("width", "row", "terms"),
     [
-        (33, None, BLIND_WITH_CLOCK[:-1]),
+        (33, None, BLIND),
         (35, None, BLIND_WITH_CLOCK),
-        (36, None, ["lin_vel", *BLIND_WITH_CLOCK[:-1]]),
-        (38, None, ["lin_vel", *BLIND_WITH_CLOCK[:-1], "scan"]),
-        (99, 33, HIM),
+        (36, None, ["lin_vel", *BLIND]),
+        (38, None, ["lin_vel", *BLIND, "scan"]),
+        (99, 33, ["command", "ang_vel", "gravity", *BLIND[3:]]),
     ],
 )
 def test_the_width_of_a_training_of_legged_gym_says_what_it_sees(tmp_path, width, row, terms):
-    robot, controller = imported(legged_gym(tmp_path / "run", width, row=row), tmp_path)
+    robot, controller = imported(legged_gym(tmp_path / "run", width, row), tmp_path)
     assert [term.term for term in controller.observation] == terms
     scales = {"lin_vel": 2.0, "ang_vel": 0.25, "command": (2.0, 2.0, 0.25), "joint_vel": 0.05, "scan": 5.0}
     assert [term.scale for term in controller.observation] == [scales.get(term, 1.0) for term in terms]
-    assert (controller.history is None) == (row is None)
-    assert (robot.default_joint_pos, robot.damping, robot.speed) == (IN_FILE, (0.5, 0.6) * 4, 0.5)
-    assert robot.stiffness == (20.0, 30.0) * 2 + (20.0, 30.0, 20.0, 35.0)  # HL, HR; the longer name comes later
-    assert (controller.joints, controller.action_clip) == (None, 10.0)  # FL, FR, HL, HR is the order of names, too
-    assert robot.scan_x == ((-0.1, 0.1) if "scan" in terms else ())
+    assert (controller.history is None, controller.joints, controller.action_clip) == (row is None, None, 10.0)
+    assert (robot.default_joint_pos, robot.damping) == (IN_FILE, (0.5,) * 8)
+    assert robot.stiffness == (20.0, 30.0) * 3 + (20.0, 35.0)  # HR is the last; its own name comes later
 
 
 def test_the_metadata_of_mjlab_are_read(tmp_path):
@@ -494,9 +489,10 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (rl_sar, {"joint_mapping": [9] * 8}, "must be a controller of rl_sar"),
         (deployment, {"num_obs": 40}, "num_obs"),
         (deployment, {"num_actions": 7}, "num_actions"),
-        (legged_gym, {"old": "control", "control": {"control_type": "T"}}, "control_type"),
-        (legged_gym, {"old": "control", "control": {"hip_scale_reduction": 0.5}}, "hip_scale_reduction"),
-        (legged_gym, {"old": "control", "control": {"stiffness": {"hip": 20.0}}}, "none of FL_knee"),
+        (legged_gym, {"control_type": "T"}, "control_type"),
+        (legged_gym, {"hip_scale_reduction": 0.5}, "hip_scale_reduction"),
+        (legged_gym, {"stiffness": {"hip": 20.0}}, "none of FL_knee"),
+        (legged_gym, {"use_actuator_network": True, "actuator_net_file": "{ROOT}/nets/net.pt"}, "net.pt is not there"),
         (mjlab, {"joint_damping": "much"}, "run.onnx must be a controller of mjlab"),
         (deployment, {"leg_joint2motor_idx": []}, "leg_joint2motor_idx"),
         (mjlab, {"observation_names": "base_lin_vel,camera"}, "camera"),
