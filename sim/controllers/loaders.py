@@ -5,6 +5,7 @@ import inspect
 import multiprocessing
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -152,6 +153,12 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
     if cfg.activation is not None and not isinstance(network, MlpPolicy | RnnPolicy | Encoded):
         raise ValueError(f"{path}: activation is of an rsl_rl checkpoint; {weights.name} says its own: leave it out")
     _try_rows(network, sizes, device, str(weights), label)
+    rows = torch.randn((64, sizes[0]), generator=torch.Generator().manual_seed(0)).to(device)
+    with torch.inference_mode():
+        reset_all(network, len(rows), device)
+        still = torch.eq(*network(rows).aminmax(dim=0)).tolist()
+    if joints := [joint for joint, is_still in zip(cfg.joints or robot.joint_names, still, strict=True) if is_still]:
+        warnings.warn(f"policy '{weights}' never moves {', '.join(joints)}", stacklevel=2)
     policy.use(network, torch.device(device))
     return policy
 

@@ -248,6 +248,15 @@ def test_weights_that_do_not_fit_a_description_are_named(tmp_path, anymal, descr
             load_policy(describe('{term = "gravity"}', line, policy=weights), anymal, "cpu")
 
 
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+def test_joints_that_a_network_never_moves_are_named(tmp_path, anymal, describe):
+    layer = torch.nn.Linear(3, ACTIONS)
+    layer.weight.data[[0, 2]] = 0.0
+    torch.jit.script(layer).save(str(tmp_path / "weights.pt"))
+    with pytest.warns(UserWarning, match=r"weights\.pt' never moves LF_HAA, LF_KFE$"):
+        load_policy(describe('{term = "gravity"}'), anymal, "cpu")
+
+
 def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):
     weights = tmp_path / "weights.pt"
     assert ControllerSpec.parse(remembering).files == (remembering, weights)
