@@ -42,7 +42,7 @@ class Booster:
             raise ValueError(f"num_observations must be {11 + 3 * count}, got {cfg['num_observations']}")
         source.set(physics_dt=cfg["dt"], decimation=control["decimation"], action_scale=control["action_scale"])
         source.set(action_clip=scales["clip_actions"])
-        source.set_joints(joints[-count:], "the last ones, as in its deployment")
+        source.set(joints=list(joints[-count:]), reason="the model's last ones, as in its deployment")
         names = {"gravity": "gravity", "ang_vel": "ang_vel", "joint_pos": "dof_pos", "joint_vel": "dof_vel"}
         gravity, ang_vel, joint_pos, joint_vel = (make_term(name, scales[key]) for name, key in names.items())
         command = make_term("command", [scales["lin_vel"], scales["lin_vel"], scales["ang_vel"]])
@@ -56,4 +56,5 @@ class Booster:
 
 def _match_joint(table: dict[str, Any], joint: str) -> Any:
     """The value of the last name that is a piece of the joint's; else that of ``default``."""
-    return [table.get("default", 0.0), *(value for key, value in table.items() if key in joint)][-1]
+    values = [value for key, value in table.items() if key in joint]
+    return values[-1] if values else table["default"]

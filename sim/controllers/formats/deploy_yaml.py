@@ -46,8 +46,8 @@ class DeployYaml:
             moved = _select_joints(action.get("joint_ids"), joints)
             is_usual = action.get("offset") == [default[joint] for joint in moved]
             action |= {"class_type": name, "joint_names": moved, "preserve_order": True, "use_default_offset": is_usual}
-        robot = {"joint_ordering": joints}
-        read_action({"actions": actions, "scene": {"robot": robot}, "sim": {}}, file.parent, source, None)
+        env = {"actions": actions, "scene": {"robot": {"joint_ordering": joints}}, "sim": {}}
+        read_action(env, file.parent, source, None)
         reason = "the order in which the motors of a limb follow each other; joints are numbered, not named"
         source.set(joints=source.settings.get("joints", joints), reason=reason)
         terms, commands = content.pop("observations"), content.pop("commands")

@@ -510,8 +510,7 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (lambda folder: deploy(folder, ("JointPositionAction", "JointVelocityAction")), {}, "JointVelocityAction"),
         (lambda folder: deploy(folder, (", 7, 5]", ", 7]")), {}, "joint_ids_map"),
         (lambda folder: deploy(folder, ("step_dt:", "gear: 1\nstep_dt:")), {}, "gear"),
-        (holosoma, {"experiment_config": None}, "it must see 37 columns"),
-        (holosoma, {"experiment_config": None, "width": 37}, "neither G1 nor T1"),
+        (holosoma, {"experiment_config": None}, "the locomotion of G1 or T1, got 74 columns"),
         (leapp, {"parameters": {"model_path": "policy.onnx", "sha256sum": "0"}}, "policy.onnx must have sha256sum 0"),
         (leapp, {"kp": "joint_pos"}, "kp must be constant"),
         (
