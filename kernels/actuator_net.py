@@ -14,11 +14,9 @@ ACTIVATIONS = ("softsign", "elu", "relu", "tanh")
 
 @wp.func
 def _activate(x: float, activation: int) -> float:
-    if activation == 0:
-        return x / (1.0 + wp.abs(x))
-    if activation == 1:
-        return wp.max(x, wp.exp(wp.min(x, 0.0)) - 1.0)
-    return wp.where(activation == 2, wp.max(x, 0.0), wp.tanh(x))
+    bounded = wp.where(activation == 0, x / (1.0 + wp.abs(x)), wp.tanh(x))
+    rectified = wp.max(x, wp.where(activation == 1, wp.exp(wp.min(x, 0.0)) - 1.0, 0.0))
+    return wp.where(activation == 1 or activation == 2, rectified, bounded)
 
 
 @wp.func
@@ -90,9 +88,8 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
                         memory[state + size + k4] = cell
                     else:
                         for j in range(4):
-                            y[4 * k4 + j] = four[j]
-                            if layer + 1 < sizes.shape[0]:
-                                y[4 * k4 + j] = _activate(four[j], activation)
+                            is_last = layer + 1 == sizes.shape[0]
+                            y[4 * k4 + j] = wp.where(is_last, four[j], _activate(four[j], activation))
                 state += 2 * size
                 x = y
                 count = size

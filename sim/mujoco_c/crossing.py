@@ -114,9 +114,8 @@ class EpisodeStates:
         if self.robot.actuator_net is not None and self._net is not None:
             if self._steps % self.robot.actuator_net.decimation == 0:
                 error = controls - self.qpos[:, 7 + self._joints]
-                torques = self._net.step(error.ravel(), self.qvel[:, 6 + self._joints].ravel())
-                self._torques = torques.reshape(controls.shape)
-            controls = self._torques
+                self._torques = self._net.step(error.ravel(), self.qvel[:, 6 + self._joints].ravel())
+            controls = self._torques.reshape(controls.shape)
         self._steps += 1
         for k in running:
             data = self.data[k]

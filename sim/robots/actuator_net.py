@@ -12,7 +12,6 @@ from sim.controllers.spec import in_one_line
 from sim.robots.robot import ActuatorNetCfg
 
 _TRIED = 64  # drives
-_TOLERANCE = 1e-4  # share of the largest torque by which layers may differ from their module
 
 
 class ActuatorNet:
@@ -73,7 +72,7 @@ class ActuatorNet:
             inputs = torch.as_tensor(self._former[:, self.inputs] * self._scale, dtype=torch.float32)
             answer, state = module(inputs[:, None], state) if self.num_recurrent else (module(inputs), state)
             theirs.append(cfg.torque_scale * answer.double().numpy().reshape(_TRIED))
-        return bool(np.allclose(ours, theirs, rtol=0.0, atol=_TOLERANCE * np.abs(theirs).max()))
+        return bool(np.allclose(ours, theirs, rtol=0.0, atol=1e-4 * np.abs(theirs).max()))
 
     def step(self, error: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
         """Torques [N m] of the next evaluation by position errors [rad] and velocities [rad/s], shape (count,) each."""

@@ -27,22 +27,20 @@ _SHOWN_DIGITS = 12  # of a hash in a message
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorNetCfg:
-    """A network that all drives of a robot have in place of PD gains, from position error and velocity to torque.
+    """A network of all drives, from target less position [rad] and velocity [rad/s] to torque [N m].
 
-    Settings have the names of Isaac Lab's ``ActuatorNetLSTM`` and ``ActuatorNetMLP``.
+    Names are Isaac Lab's. ``file`` is TorchScript, relative to the robot's settings. A torque is held for
+    ``decimation`` physics steps.
     """
 
     file: Path
-    """TorchScript; relative to the robot's settings."""
     pos_scale: float = 1.0
-    """Factor of the target less the position [rad]."""
     vel_scale: float = 1.0
     torque_scale: float = 1.0
     input_order: Literal["pos_vel", "vel_pos"] = "pos_vel"
     input_idx: tuple[NonNegativeInt, ...] = ()
     """Evaluations ago of which dense layers see error and velocity; if empty, the last ones, the newest first."""
     decimation: PositiveInt = 1
-    """Physics steps from one evaluation to the next; meanwhile the torque is held."""
 
 
 @dataclass(frozen=True, kw_only=True)

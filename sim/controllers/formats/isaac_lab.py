@@ -78,9 +78,7 @@ def _read_actuators(groups: dict[str, Any], source: Source) -> None:
     omitted = [*_IDEAL_DRIVE] if len(ideal) == len(groups) else []
     if nets := [name for name, group in groups.items() if group.get("network_file")]:
         if len(groups) > 1:
-            raise ValueError(
-                f"{source.file}: the actuator network of {nets[0]} must drive all joints, got {len(groups)} groups"
-            )
+            raise ValueError(f"{source.file}: the network of {nets[0]} must drive all joints, got {', '.join(groups)}")
         net = groups[nets[0]]
         settings = {key: net[key] for key in _NET_SETTINGS if net.get(key) not in (None, 1.0, "pos_vel")}
         text = to_toml({"file": Path(net["network_file"]).name, **settings})

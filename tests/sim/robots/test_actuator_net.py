@@ -40,6 +40,7 @@ def read_dog(folder, module, settings="", more=""):
     folder.mkdir(exist_ok=True)
     torch.jit.save(torch.jit.script(module), folder / "net.pt")
     file = write_dog(folder, more=f'\n    actuator_net=ActuatorNetCfg(file="net.pt", {settings}),{more}')
+    file = file.rename(folder / "net_dog.py")  # other tests import a dog
     file.write_text("from sim.robots.robot import ActuatorNetCfg\n" + file.read_text())
     return get_robot(str(file))
 
