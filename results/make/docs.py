@@ -412,6 +412,14 @@ def league() -> str:
     return table(read("results/public.json").get("controllers", {}), columns)
 
 
+def films() -> str:
+    """A minimal failure of each public controller that has a film."""
+    names = [
+        name for name in read("results/public.json")["controllers"] if (ROOT / f"docs/pictures/{name}.gif").exists()
+    ]
+    return "\n".join(f"![{name}](pictures/{name}.gif)" for name in names)
+
+
 def speed() -> str:
     """Quoted speeds by robot, with the devices and commits of the numbers."""
     rows = {}
@@ -495,7 +503,7 @@ TABLES: dict[str, Callable[..., str]] = {
     make.__name__: make
     for make in (
         *(archives, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement),
-        *(minimal, packs, league, speed, kernels, noise, conditions, condition_examples, differences),
+        *(minimal, packs, league, films, speed, kernels, noise, conditions, condition_examples, differences),
     )
 }
 
