@@ -31,6 +31,7 @@ _URDF_FRICTION = 1.0
 _URDF_TIME_CONSTANT_S = 0.01
 _SKEW = 0.01  # share by which a principal axis may miss a joint's
 _MATRIX = [[0, 3, 4], [3, 1, 5], [4, 5, 2]]  # of MuJoCo's xx, yy, zz, xy, xz, yz
+_SMALL_MARGIN = 1e-3  # of a geom, which MuJoCo Menagerie's robots have and which is left out [m]
 _LEAST_GYRATION = 1e-4  # radius of gyration below which a body is a point [m]
 _CONSTRAINT_FLAGS = ("constraint", "equality", "frictionloss", "limit", "contact", "refsafe")
 _FORCE_FLAGS = ("spring", "damper", "gravity", "clampctrl", "actuation")
@@ -335,6 +336,7 @@ def _name_geoms(spec: Any) -> None:
                     geom.name += "_"
             taken.add(geom.name)
             geom.contype, geom.conaffinity = 1, 0
+            geom.margin *= geom.margin > _SMALL_MARGIN
 
 
 def _refused_elements(spec: Any) -> Iterator[str]:
