@@ -6,7 +6,8 @@ from typing import Any
 from sim.controllers.formats.source import Source, find_weights, make_term
 from sim.files.settings import YAML_SUFFIXES, read_yaml
 
-_DEPLOYED = {"default_joint_pos": "default_qpos", "effort_limit": "torque_limit"}
+_GAINS = ("stiffness", "damping")
+_DEPLOYED = {"default_joint_pos": "default_qpos", "effort_limit": "torque_limit"} | {name: name for name in _GAINS}
 
 
 class Booster:
@@ -22,22 +23,24 @@ class Booster:
 
     def read(self, path: Path, source: Source) -> Path:
         """Settings of the YAML, whose lists end with the legs; returns the exported network."""
-        cfg, joints, gains = read_yaml(path), source.joints, ("stiffness", "damping")
+        cfg = read_yaml(path)
+        joints = source.joints
         if "policy" in cfg:
-            values = {name: cfg["common"][_DEPLOYED.get(name, name)][-len(joints) :] for name in (*_DEPLOYED, *gains)}
+            values = {name: cfg["common"][key][-len(joints) :] for name, key in _DEPLOYED.items()}
             cfg |= cfg["policy"] | cfg["common"]
         else:
-            tables = {name: cfg["control"][name] for name in gains}
+            tables = {name: cfg["control"][name] for name in _GAINS}
             tables["default_joint_pos"] = cfg["init_state"]["default_joint_angles"]
             values = {name: [_match_joint(table, joint) for joint in joints] for name, table in tables.items()}
-            frequency = sum(cfg["commands"]["gait_frequency"]) / 2.0
-            cfg |= (
-                cfg["env"] | cfg["sim"] | {"gait_frequency": frequency, "policy_path": f"deploy/models/{path.stem}.pt"}
-            )
+            cfg |= cfg["env"] | cfg["sim"]
+            cfg["gait_frequency"] = sum(cfg["commands"]["gait_frequency"]) / 2.0
+            cfg["policy_path"] = f"deploy/models/{path.stem}.pt"
         source.move(values, {name: name for name in values}, joints)
         if "mech" in cfg:
             source.reasons["damping"] = "of the ankles' parallel motors; envs/T1.yaml of the training has the joints'"
-        control, scales, count = cfg["control"], cfg["normalization"], cfg["num_actions"]
+        control = cfg["control"]
+        scales = cfg["normalization"]
+        count = cfg["num_actions"]
         if cfg["num_observations"] != 11 + 3 * count:
             raise ValueError(f"num_observations must be {11 + 3 * count}, got {cfg['num_observations']}")
         source.set(physics_dt=cfg["dt"], decimation=control["decimation"], action_scale=control["action_scale"])

@@ -50,7 +50,8 @@ class DeployYaml:
         read_action(env, file.parent, source, None)
         reason = "the order in which the motors of a limb follow each other; joints are numbered, not named"
         source.set(joints=source.settings.get("joints", joints), reason=reason)
-        terms, commands = content.pop("observations"), content.pop("commands")
+        terms = content.pop("observations")
+        commands = content.pop("commands")
         by = "row" if terms.pop("use_gym_history", False) else "term"
         source.refuse_unknown([*content, *terms], _FUNCTIONS)
         rows = []

@@ -38,20 +38,21 @@ class Holosoma:
         """Settings of the metadata; the file is also that of the weights."""
         width = find_widths(load_network(path, "cpu", None, label="it"))[0]
         content = {key: json.loads(text) for key, text in read_metadata(path).items()}
-        joints, cfg, reason = content["dof_names"], content.get("experiment_config"), ""
+        joints = content["dof_names"]
+        cfg = content.get("experiment_config")
         source.find_model_file(content.get("robot_urdf_path"))
         pose, terms = next((robot for joint, robot in _ROBOTS.items() if joint in joints), ({}, {}))
         if cfg is None:
             if not pose or width != 3 * len(joints) + 13:
                 got = f"{width} columns for {joints[0]}, ..."
                 raise ValueError(f"without experiment_config it must be the locomotion of G1 or T1, got {got}")
-            reason = "of holosoma_inference's own configuration, since the file has no experiment_config"
             terms = terms | {name: {} for name in ("actions", "dof_pos", "projected_gravity", *_ORDERS)}
 
         def look_up(name: str, usual: Any) -> Any:
             """A value of the experiment_config, whose name has dots; the usual one if there is none."""
             return usual if cfg is None else functools.reduce(dict.__getitem__, name.split("."), cfg)
 
+        reason = "of holosoma_inference's own configuration, since the file has no experiment_config" * (cfg is None)
         control = look_up("robot.control", {"action_scale": 0.25, "action_clip_value": 100.0})
         if control.get("action_scales_by_effort_limit_over_p_gain"):
             raise ValueError(f"{source.file}: action_scales_by_effort_limit_over_p_gain is not supported")
