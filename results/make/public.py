@@ -43,7 +43,7 @@ from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
 
 CONTROLLERS = LEAGUE["controllers"]
-ITERATIONS = 4
+ITERATIONS = 3
 """Of preset wide."""
 HEIGHTS = (0.05, 0.1, 0.2)
 """Of terrains that all controllers cross [m]."""
