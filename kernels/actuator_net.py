@@ -46,10 +46,10 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
         """Grid (num_envs, num_actuators): write torques [N m] in place of the joint targets in ``ctrl``.
 
         ``weights`` lie layer by layer, and in it by four rows: their biases, then those of each input. Four rows are
-        the gates i, f, g and o of a unit of an LSTM, whose inputs end with the hidden state, or four units of a dense
-        layer. ``sizes`` are the layers' units, (num_layers,), and ``inputs`` columns of the memory, (num_inputs,). A
-        drive's memory, 0 when an episode begins, is the number of steps, the torque, error [rad] and velocity [rad/s]
-        of each evaluation, the newest first, and hidden and cell state of each LSTM.
+        the gates i, f, g and o of a unit of an LSTM, whose inputs end with the hidden state, or one of each quarter of
+        a dense layer. ``sizes`` are the layers' units, (num_layers,), and ``inputs`` columns of the memory. A drive's
+        memory, 0 when an episode begins, is the number of steps, the torque, error [rad] and velocity [rad/s] of each
+        evaluation, the newest first, and hidden and cell state of each LSTM.
         """
         env, k = wp.tid()
         memory = memory_out[env, k]
@@ -69,9 +69,9 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
             row = int(0)
             for layer in range(sizes.shape[0]):
                 size = sizes[layer]
-                num_fours = (size + 3) // 4
-                if layer < num_recurrent:
-                    num_fours = size
+                is_recurrent = layer < num_recurrent
+                num_fours = wp.where(is_recurrent, size, (size + 3) // 4)
+                if is_recurrent:
                     for j in range(size):
                         x[count + j] = memory[state + j]
                     count += size
@@ -81,7 +81,7 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
                     for j in range(count):
                         four += weights[row + 1 + j] * x[j]
                     row += 1 + count
-                    if layer < num_recurrent:
+                    if is_recurrent:
                         cell = _sigmoid(four[1]) * memory[state + size + k4] + _sigmoid(four[0]) * wp.tanh(four[2])
                         y[k4] = _sigmoid(four[3]) * wp.tanh(cell)
                         memory[state + k4] = y[k4]
@@ -89,7 +89,7 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
                     else:
                         for j in range(4):
                             is_last = layer + 1 == sizes.shape[0]
-                            y[4 * k4 + j] = wp.where(is_last, four[j], _activate(four[j], activation))
+                            y[j * num_fours + k4] = wp.where(is_last, four[j], _activate(four[j], activation))
                 state += 2 * size
                 x = y
                 count = size

@@ -104,8 +104,7 @@ def resolved(robot: RobotCfg) -> tuple[RobotCfg, SolverCfg]:
     decimation = max(robot.decimation, math.ceil(control_s / _RESOLVED_DT - 1e-6))
     step = round(control_s / decimation, 12)
     delay = round(robot.drive_delay_steps * robot.physics_dt / step)
-    finer = replace(robot, physics_dt=step, decimation=decimation, drive_delay_steps=delay)
-    if (net := robot.actuator_net) is not None:  # it goes on at its own rate
-        net = replace(net, decimation=round(net.decimation * robot.physics_dt / step))
-        finer = replace(finer, actuator_net=net)
+    net = robot.actuator_net  # it goes on at its own rate
+    net = net and replace(net, decimation=round(net.decimation * robot.physics_dt / step))
+    finer = replace(robot, physics_dt=step, decimation=decimation, drive_delay_steps=delay, actuator_net=net)
     return finer, SolverCfg(time_constant_s=_RESOLVED_TIME_CONSTANT_S)

@@ -195,12 +195,12 @@ class Simulation:
         joints = [int(np.flatnonzero(columns == column)[0]) for column in moved]
         num_pose, num_feet, num_torques = robot.sense_sizes
         scan_x, scan_y = robot.scan_points()
-        arrays = {"default_joint_pos": robot.default_joint_pos, "scan_x": scan_x, "scan_y": scan_y}
-        numbers = {name: wp.array(row, dtype=float) for name, row in arrays.items()}
+        numbers = {"default_joint_pos": robot.default_joint_pos, "scan_x": scan_x, "scan_y": scan_y}
         feet = len(robot.geom_names) - num_feet + np.arange(num_feet)
         indices = {"foot_columns": feet, "torque_columns": columns[:num_torques] - 1}
-        numbers |= {name: wp.array(row, dtype=int) for name, row in indices.items()}
-        self.sensors = make_struct(Sensors, num_pose=num_pose, **numbers)
+        arrays = {name: wp.array(row, dtype=float) for name, row in numbers.items()}
+        arrays |= {name: wp.array(row, dtype=int) for name, row in indices.items()}
+        self.sensors = make_struct(Sensors, num_pose=num_pose, **arrays)
         bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
         self._coordinates = make_struct(
             SolverState,
@@ -216,9 +216,7 @@ class Simulation:
             effort = solver.mjw_model.actuator_forcerange.numpy()[0, :, 1]
             motors = np.array([robot.saturation_effort, robot.velocity_limit])[:, joints]
             self.motors = wp.array(np.stack([effort, *motors], axis=1), dtype=wp.vec3)
-        self._net = None
-        if robot.actuator_net is not None:
-            self._build_net(robot.actuator_net)
+        self._net = None if robot.actuator_net is None else self._build_net(robot.actuator_net)
         max_steps = robot.drive_delay_steps
         if self.bank.conditions is not None:
             max_steps += math.ceil(MAX_LATENCY_S / robot.physics_dt)
@@ -229,15 +227,15 @@ class Simulation:
             self._delay.steps.fill_(robot.drive_delay_steps)
             self._delay.at_first = self.sensors.default_joint_pos
 
-    def _build_net(self, cfg: ActuatorNetCfg) -> None:
-        net = ActuatorNet(cfg, 0)
+    def _build_net(self, cfg: ActuatorNetCfg) -> tuple[Any, ...]:
+        net = ActuatorNet(cfg)
         how = {name: getattr(net, name) for name in ("num_recurrent", "activation", "history")}
         width = max(layer.shape[1] + 3 for layer in net.layers)  # dense units come in fours
         self._write_torques = make_torques(width, decimation=cfg.decimation, **how)
-        rows = [np.pad(layer, ((0, -len(layer) % 4), (0, 0))).reshape(-1, 4, layer.shape[1]) for layer in net.layers]
         num_columns = 2 + 2 * net.history + 2 * sum(net.sizes[: net.num_recurrent])
-        self._net = (
-            wp.array(np.concatenate([four.swapaxes(1, 2).reshape(-1, 4) for four in rows]), dtype=wp.vec4),
+        rows = [np.pad(layer, ((0, -len(layer) % 4), (0, 0))).reshape(4, -1, layer.shape[1]) for layer in net.layers]
+        return (
+            wp.array(np.concatenate([four.transpose(1, 2, 0).reshape(-1, 4) for four in rows]), dtype=wp.vec4),
             wp.array(net.sizes, dtype=int),
             wp.array(2 + np.array(net.inputs), dtype=int),
             wp.zeros((*self.solver.mjw_data.ctrl.shape, num_columns), dtype=float),
@@ -254,12 +252,9 @@ class Simulation:
             )
         assert self.bank.ground is not None
         robot = self.robot
-        self._varied = self.dynamics.vary_bases(
-            delay_steps=self._delay.steps,
-            friction=self.bank.ground.factor,
-            drive_delay=robot.drive_delay_steps,
-            physics_dt=robot.physics_dt,
-        )
+        drives = {"drive_delay": robot.drive_delay_steps, "delay_steps": self._delay.steps}
+        friction = self.bank.ground.factor
+        self._varied = self.dynamics.vary_bases(**drives, friction=friction, physics_dt=robot.physics_dt)
         observed = (self.num_envs, robot.observation_size)
         rows = (self.num_envs, self.bank.conditions.shape[1])
         former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)

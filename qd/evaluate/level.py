@@ -5,7 +5,6 @@ controller, and stored beside the penalty scales as ``<name>.level.json``.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -31,48 +30,39 @@ _EPISODES = 20
 _MIN_SPEED = 0.15  # a slower controller does not walk, whatever its time [m/s]
 _SPARE_TIME = 1.25  # a crossing gets so many times what it takes on level ground
 _DISTANCE = math.dist(CrossingCfg.start, CrossingCfg.goal)
-_KEYS = ("episodes", "goal", "speed", "height")
 _ENGINES: dict[str, tuple[Engine, str]] = {"searched": ("search", ""), "mujoco_c": ("mujoco_c_search", "_mujoco_c")}
 Walks = dict[str, dict[str, float]]
 
 
-def walk(crosser: Crosser, policy: str, seed: int = 0, names: Sequence[str] = tuple(_ENGINES)) -> Walks:
-    """How a controller walks over level ground here, ``searched``, and in MuJoCo C, ``mujoco_c``, at the same steps.
+def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = False) -> Walks:
+    """How a controller walks over level ground here, ``searched``, and if asked in MuJoCo C, ``mujoco_c``.
 
     Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` toward the goal until the
-    end [m/s], and ``height`` of the base at the end [m]; all are 0 without a valid episode.
+    end [m/s], and ``height`` of the base at the end [m]; all are 0 without a valid episode. What was measured of a
+    user's robot as it is, under this controller, is read from its file; the rest is added to it.
     """
-    level = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.array([seed]))
-    walks: Walks = {}
-    for name in names:
-        engine, _ = _ENGINES[name]
-        result = crosser.cross(policy, level, replicas=_EPISODES, engine=engine, label="level ground", invalid_ok=True)
-        valid = ~result.invalid
-        end = result.final_position[valid]
-        covered = _DISTANCE - np.linalg.norm(end[:, :2] - CrossingCfg.goal, axis=1)
-        numbers = {"goal": result.reached_goal[valid], "speed": covered / result.duration_s[valid], "height": end[:, 2]}
-        means = {key: float(values.mean()) if valid.any() else 0.0 for key, values in numbers.items()}
-        walks[name] = {"episodes": int(valid.sum()), **means}
-    return walks
-
-
-def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = False) -> Walks:
-    """How the crosser's robot walks over level ground (:func:`walk`), in MuJoCo C too if ``mujoco_c``.
-
-    What was measured of a user's robot as it is, under this controller, is read from its file; the rest is added to it.
-    """
-    robot, names = crosser.robot, [*_ENGINES][: 1 + mujoco_c]
+    robot = crosser.robot
     file, identity = robot.home / f"{crosser_name(robot, policy)}.level.json", controller_identity(robot, policy)
     is_stored = robot.settings_file is not None and identity["policy_sha256"] is not None
     stored: dict[str, Any] = read_json(file) if is_stored and file.exists() else {}
     stored = stored if identity.items() <= stored.items() else {**identity}
-    for name in names:
-        if f"flat_episodes{_ENGINES[name][1]}" not in stored:
-            (numbers,) = walk(crosser, policy, names=[name]).values()
-            stored |= {f"flat_{key}{_ENGINES[name][1]}": value for key, value in numbers.items()}
+    level = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.zeros(1, int))
+    walks: Walks = {}
+    for name, (engine, suffix) in [*_ENGINES.items()][: 1 + mujoco_c]:
+        keys = {key: f"flat_{key}{suffix}" for key in ("episodes", "goal", "speed", "height")}
+        if keys["episodes"] not in stored:
+            cross = {"replicas": _EPISODES, "engine": engine, "label": "level ground", "invalid_ok": True}
+            result = crosser.cross(policy, level, **cross)
+            valid = ~result.invalid
+            end = result.final_position[valid]
+            covered = _DISTANCE - np.linalg.norm(end[:, :2] - CrossingCfg.goal, axis=1)
+            columns = (result.reached_goal[valid], covered / result.duration_s[valid], end[:, 2])
+            means = [float(values.mean()) if valid.any() else 0.0 for values in columns]
+            stored |= zip(keys.values(), [int(valid.sum()), *means], strict=True)
             if is_stored:
                 write_atomically(file, to_json({**crosser.compute.origin(0), **stored}))
-    return {name: {key: stored[f"flat_{key}{_ENGINES[name][1]}"] for key in _KEYS} for name in names}
+        walks[name] = {key: stored[column] for key, column in keys.items()}
+    return walks
 
 
 def give_time(robot: RobotCfg, policy: str, compute: Compute) -> RobotCfg:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from qd.evaluate.level import walk
+from qd.evaluate.level import measure_level_ground
 from qd.evaluate.measures import valid_interval
 from qd.faults.judge import count_outcomes, elite_seeds, judge
 from qd.faults.numbers import EPISODES
@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         summary = RunDirectory(runs / drive).read_summary()
         drives[drive] = {
             **robot_identity(robot),
-            "level": {name: walk(crossers[drive], policy)["searched"] for name, policy in policies.items()},
+            "level": {name: measure_level_ground(crossers[drive], file)["searched"] for name, file in policies.items()},
             "archive": {count: summary.get(count) for count in (*FRESH_COUNTS, "confirmed")},
             "crossed": cross_failures(archive, crossers, policies, script.seed),
         }

@@ -102,7 +102,6 @@ class EpisodeStates:
         self._effort = model.actuator_forcerange[:, 1] / self.strength
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
         self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
-        self._steps = 0
         self._net = robot.actuator_net and ActuatorNet(robot.actuator_net, len(self.data) * model.nu)
         self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
         self._delayed = deque([self._targets.copy()] * self.delay_steps)
@@ -111,20 +110,15 @@ class EpisodeStates:
         """One physics step of the numbered episodes."""
         self._delayed.append(self._targets.copy())
         controls = self._delayed.popleft()[:, self._joints]
-        if self.robot.actuator_net is not None and self._net is not None:
-            if self._steps % self.robot.actuator_net.decimation == 0:
-                error = controls - self.qpos[:, 7 + self._joints]
-                self._torques = self._net.step(error.ravel(), self.qvel[:, 6 + self._joints].ravel())
-            controls = self._torques.reshape(controls.shape)
-        self._steps += 1
+        if self._net is not None:
+            controls = self._net.step(controls - self.qpos[:, 7 + self._joints], self.qvel[:, 6 + self._joints])
         for k in running:
             data = self.data[k]
             data.ctrl[:] = controls[k]
             if self._motors is not None:
-                (stall, limit) = self._motors
-                effort = self._effort
+                stall, limit = self._motors
                 lost = stall * data.qvel[6 + self._joints] / limit
-                limits = np.clip([-stall - lost, stall - lost], -effort, effort).T
+                limits = np.clip([-stall - lost, stall - lost], -self._effort, self._effort).T
                 self._model.actuator_forcerange[:] = self.strength * limits
             mj.mj_step(self._model, data)
             self.qpos[k] = data.qpos
@@ -149,12 +143,10 @@ def _judge(robot: RobotCfg, episodes: EpisodeStates, running: NDArray[np.intp], 
     cfg = CrossingCfg
     qpos = episodes.qpos[running]
     qvel = episodes.qvel[running]
-    x = qpos[:, 0]
-    y = qpos[:, 1]
+    position = qpos[:, :2]
     outcome = np.full(len(running), Outcome.RUNNING)
-    outside = (x < cfg.lower[0]) | (x > cfg.upper[0]) | (y < cfg.lower[1]) | (y > cfg.upper[1])
-    outcome[outside] = Outcome.OUT
-    outcome[np.hypot(cfg.goal[0] - x, cfg.goal[1] - y) < cfg.goal_radius] = Outcome.GOAL
+    outcome[((position < cfg.lower) | (position > cfg.upper)).any(axis=1)] = Outcome.OUT
+    outcome[np.hypot(*(cfg.goal - position).T) < cfg.goal_radius] = Outcome.GOAL
     force = np.linalg.norm(episodes.forces[running][:, base], axis=2).max(axis=1)
     outcome[force > cfg.base_force] = Outcome.BASE_COLLISION
     finite = np.isfinite(qpos).all(axis=1) & (np.abs(qvel) <= robot.max_speed).all(axis=1)
@@ -181,8 +173,7 @@ def cross_in_mujoco_c(
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
     episodes = EpisodeStates(robot, model, starts, None if ground is None else ground.rows[0].astype(np.float64))
     count = len(starts.qpos)
-    base = np.array([name in robot.base_geoms for name in robot.geom_names])
-    feet = np.array([name in robot.foot_geoms for name in robot.geom_names])
+    base, feet = (np.isin(robot.geom_names, names) for names in (robot.base_geoms, robot.foot_geoms))
     default = np.array(robot.default_joint_pos)
     scan = np.stack(robot.scan_points(), axis=1)
     outcome = np.full(count, Outcome.RUNNING)
@@ -201,9 +192,8 @@ def cross_in_mujoco_c(
             qvel = episodes.qvel[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, robot.speed)
-            row = observations(
-                heights, qpos, qvel, command[running], last_action[running], default_joint_pos=default, scan=scan
-            )
+            seen = (heights, qpos, qvel, command[running], last_action[running])
+            row = observations(*seen, default_joint_pos=default, scan=scan)
             senses = sense_columns(robot.senses, qpos, episodes.forces[running][:, feet], episodes.torques[running])
             rows[running] = np.concatenate([row, senses], axis=1)
             rows = episodes.disturb(rows, running, step)

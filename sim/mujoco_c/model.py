@@ -198,18 +198,14 @@ def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:
     Each cell is cut from its (low x, high y) to its (high x, low y) corner. Heights [m] have shape (nrow, ncol); beyond
     its edge the edge height continues. Points are x and y [m] of any one shape.
     """
-    limit_row = heights.shape[0] - 1
-    limit_col = heights.shape[1] - 1
-    column = np.clip(x / SPACING, 0.0, limit_col)
-    row = np.clip(y / SPACING, 0.0, limit_row)
-    j = np.minimum(column.astype(int), limit_col - 1)
-    i = np.minimum(row.astype(int), limit_row - 1)
+    num_rows, num_cols = heights.shape
+    column = np.clip(x / SPACING, 0.0, num_cols - 1)
+    row = np.clip(y / SPACING, 0.0, num_rows - 1)
+    j = np.minimum(column.astype(int), num_cols - 2)
+    i = np.minimum(row.astype(int), num_rows - 2)
     u = column - j
     v = row - i
-    near = heights[i, j]
-    far = heights[i + 1, j + 1]
-    along_x = heights[i, j + 1]
-    along_y = heights[i + 1, j]
+    (near, along_x), (along_y, far) = ((heights[k, j], heights[k, j + 1]) for k in (i, i + 1))
     lower = near + u * (along_x - near) + v * (along_y - near)
     upper = far + (1 - u) * (along_y - far) + (1 - v) * (along_x - far)
     return np.where(u + v <= 1, lower, upper)
@@ -288,12 +284,8 @@ def step_penalties(
     States and commands are those of :func:`observations`; contact forces on each geom with a role, world frame [N],
     have shape (num, num_geoms, 3). ``feet``, shape (num_geoms,), may be touched; up to the limit [N] it costs nothing.
     """
+    velocity = _base_velocity(qpos, qvel)
     step = PlainStep(
-        velocity=_base_velocity(qpos, qvel),
-        ang_vel=qvel[:, 3:6],
-        command=command,
-        forces=forces,
-        feet=feet,
-        force_limit=force_limit,
+        velocity=velocity, ang_vel=qvel[:, 3:6], command=command, forces=forces, feet=feet, force_limit=force_limit
     )
     return np.stack([penalty.plain(step).astype(float) for penalty in PENALTIES.values()], axis=1)

@@ -12,39 +12,41 @@ from sim.controllers.spec import in_one_line
 from sim.robots.robot import ActuatorNetCfg
 
 _TRIED = 64  # drives
+Array = NDArray[np.float64]
 
 
 class ActuatorNet:
     """A network of ``count`` drives from the beginning of an episode on, in NumPy.
 
-    ``layers`` have the rows of :func:`kernels.actuator_net.make_torques`, each with its bias first; ``sizes``,
-    ``num_recurrent``, ``activation`` and ``history`` are those of the kernel, ``inputs`` begin two columns later there.
+    ``layers`` are matrices, with the bias first, of rows gate by gate of an LSTM; ``sizes``, ``num_recurrent``,
+    ``activation`` and ``history`` are those of :func:`kernels.actuator_net.make_torques`; ``inputs`` begin two columns
+    later there.
     """
 
-    def __init__(self, cfg: ActuatorNetCfg, count: int) -> None:
+    def __init__(self, cfg: ActuatorNetCfg, count: int = 0) -> None:
         """Loads the file as data; an error says what is wrong with it."""
+        self._cfg = cfg
         try:
             module = torch.jit.load(str(cfg.file), map_location="cpu").eval()
-            self._read_layers({name: value.double().numpy() for name, value in module.state_dict().items()}, cfg)
-            if not any(self._answers_like(module, cfg, index) for index in range(len(ACTIVATIONS))):
+            self._read_layers({name: value.double().numpy() for name, value in module.state_dict().items()})
+            if not any(self._answers_like(module, index) for index in range(len(ACTIVATIONS))):
                 raise ValueError("its layers do not answer as it does")
         except Exception as error:  # a foreign file can fail with anything
             must = f"TorchScript of LSTMs and a dense layer, or of dense layers with {', '.join(ACTIVATIONS)} between"
             raise ValueError(f"actuator_net.file must be {must}, got {cfg.file}: {in_one_line(error)}") from error
         self._begin(count)
 
-    def _read_layers(self, weights: dict[str, NDArray[np.float64]], cfg: ActuatorNetCfg) -> None:
+    def _read_layers(self, weights: dict[str, Array]) -> None:
         lstms = [name for name in weights if "weight_ih" in name]
         names = [*lstms, *(name for name in weights if name.endswith(".weight"))]
         columns = [[weights[name.replace("weight", "bias")], weights[name]] for name in names]
         for layer, name in zip(columns, lstms, strict=False):
             layer[0] = layer[0] + weights[name.replace("weight_ih", "bias_hh")]
             layer.append(weights[name.replace("weight_ih", "weight_hh")])
-            layer[:] = (np.stack(np.split(part, 4), axis=1).reshape(part.shape) for part in layer)  # unit by unit
         self.num_recurrent = len(lstms)
         self.layers = [*map(np.column_stack, columns)]
-        self.sizes = [len(layer[0]) // (4 if k < len(lstms) else 1) for k, layer in enumerate(columns)]
-        count = columns[0][1].shape[1]
+        self.sizes = [len(weights[name]) // (4 if name in lstms else 1) for name in names]
+        cfg, count = self._cfg, columns[0][1].shape[1]
         ago = cfg.input_idx or tuple(range(count // 2))
         if 2 * len(ago) != count:
             raise ValueError(f"it has {count} inputs, expected input_idx of {count // 2} numbers, got {ago}")
@@ -57,30 +59,36 @@ class ActuatorNet:
         self.layers[-1] *= cfg.torque_scale * buffers.get("out_scale", 1.0)
 
     def _begin(self, count: int) -> None:
+        self._steps = 0
         self._former = np.zeros((count, 2 * self.history))
         self._state = np.zeros((self.num_recurrent, 2, count, self.sizes[0]))
 
     @torch.inference_mode()
-    def _answers_like(self, module: Any, cfg: ActuatorNetCfg, activation: int) -> bool:
+    def _answers_like(self, module: Any, activation: int) -> bool:
         """Whether the layers, with this activation, answer as their module does in some steps."""
         self.activation = activation
         self._begin(_TRIED)
         state = tuple(torch.zeros((self.num_recurrent, _TRIED, self.sizes[0])) for _ in range(2))
         ours, theirs = [], []
         for error, velocity in np.random.default_rng(0).normal(size=(5, 2, _TRIED)):
-            ours.append(self.step(error, velocity))
+            ours.append(self._evaluate(error, velocity))
             inputs = torch.as_tensor(self._former[:, self.inputs] * self._scale, dtype=torch.float32)
             answer, state = module(inputs[:, None], state) if self.num_recurrent else (module(inputs), state)
-            theirs.append(cfg.torque_scale * answer.double().numpy().reshape(_TRIED))
+            theirs.append(self._cfg.torque_scale * answer.double().numpy().reshape(_TRIED))
         return bool(np.allclose(ours, theirs, rtol=0.0, atol=1e-4 * np.abs(theirs).max()))
 
-    def step(self, error: NDArray[np.float64], velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Torques [N m] of the next evaluation by position errors [rad] and velocities [rad/s], shape (count,) each."""
+    def step(self, error: Array, velocity: Array) -> Array:
+        """Torques [N m] of a physics step by position errors [rad] and velocities [rad/s], all of one shape."""
+        if self._steps % self._cfg.decimation == 0:
+            self._torques = self._evaluate(error.ravel(), velocity.ravel()).reshape(error.shape)
+        self._steps += 1
+        return self._torques
+
+    def _evaluate(self, error: Array, velocity: Array) -> Array:
         self._former = np.column_stack([error, velocity, self._former[:, :-2]])
         x = self._former[:, self.inputs]
         for layer, (hidden, cell) in zip(self.layers, self._state, strict=False):
-            gates = layer[:, 0] + np.hstack([x, hidden]) @ layer[:, 1:].T
-            i, f, g, o = np.moveaxis(gates.reshape(*cell.shape, 4), -1, 0)
+            i, f, g, o = np.split(layer[:, 0] + np.hstack([x, hidden]) @ layer[:, 1:].T, 4, axis=1)
             cell[:] = expit(f) * cell + expit(i) * np.tanh(g)
             hidden[:] = x = expit(o) * np.tanh(cell)
         activate = getattr(torch.nn.functional, ACTIVATIONS[self.activation])

@@ -50,7 +50,7 @@ def load_robot(path: Path) -> RobotCfg:
         robot = replace(robot, model_file=model, settings_file=file, actuator_net=net)
         check_settings(robot)
         if net is not None:
-            ActuatorNet(net, 0)
+            ActuatorNet(net)
         robot_file = read_robot_file(robot.model_file)
         builder = make_builder(robot_file.model)
         mistakes = [*settings_problems(robot), *file_problems(robot, robot_file)]

@@ -51,7 +51,7 @@ def test_torques_are_those_of_the_module_in_both(tmp_path, device, kind):
     torch.manual_seed(0)
     module, settings = {
         "lstm": (Lstm(), "decimation=2, torque_scale=-2.0"),
-        "dense": (make_dense(4, 8, 8, 1), "pos_scale=-2.0, input_order='vel_pos', input_idx=(0, 3)"),
+        "dense": (make_dense(4, 6, 8, 1), "pos_scale=-2.0, input_order='vel_pos', input_idx=(0, 3)"),
     }[kind]
     robot = read_dog(tmp_path, module, settings, "\n    drive_delay_steps=1,")
     finer = resolved(robot)[0].actuator_net
