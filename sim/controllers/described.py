@@ -204,22 +204,9 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
     if row.ndim != 2 or row.shape[1] != robot.observation_size:
         raise ValueError(f"row must have shape (num_envs, {robot.observation_size}), got {tuple(row.shape)}")
     pose, feet, torques = robot.sense_sizes
-    sizes = (
-        3,
-        3,
-        3,
-        2,
-        1,
-        *[robot.num_joints] * 3,
-        robot.num_scan_points,
-        min(pose, 3),
-        max(pose - 3, 0),
-        feet,
-        torques,
-    )
-    lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan, *senses = row.split(
-        sizes, dim=1
-    )
+    senses = min(pose, 3), max(pose - 3, 0), feet, torques
+    columns = row.split([3, 3, 3, 2, 1, *[robot.num_joints] * 3, robot.num_scan_points, *senses], dim=1)
+    lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan, *_ = columns
     return Sensed(
         lin_vel=lin_vel / LIN_VEL_SCALE,
         ang_vel=ang_vel / ANG_VEL_SCALE,
@@ -229,10 +216,10 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
         joint_vel=joint_vel / JOINT_VEL_SCALE,
         last_action=last_action,
         scan=(scan / SCAN_SCALE + SCAN_OFFSET).reshape(len(row), len(robot.scan_x), len(robot.scan_y)),
-        base_pos=senses[0],
-        quat=senses[1],
-        contacts=senses[2] / FORCE_SCALE,
-        torques=senses[3] / FORCE_SCALE,
+        base_pos=columns[-4],
+        quat=columns[-3],
+        contacts=columns[-2] / FORCE_SCALE,
+        torques=columns[-1] / FORCE_SCALE,
     )
 
 
@@ -357,6 +344,7 @@ class Described(torch.nn.Module):
 
     def _find_columns(self, term: Term) -> Sequence[int]:
         """The columns of its quantity that a term takes."""
+        robot = self.robot
         if "joints" in TERMS[term.term]:
             return self._moved if term.joints is None else self._find_joints(term.joints)
         if term.term in ("rpy", "heading", "quat", "command"):
@@ -366,18 +354,15 @@ class Described(torch.nn.Module):
             sizes |= {"constant": np.size(term.value)}
             sizes |= {"clock": np.size(term.offset or 0.0) * len((term.order or "").split())}
             return range(sizes.get(term.term, 3))
-        xs, ys = term.x or self.robot.scan_x, term.y or self.robot.scan_y
-        points = [(x, y) for y in ys for x in xs] if term.order == "x fastest" else [(x, y) for x in xs for y in ys]
-        scan_points = zip(*self.robot.scan_points(), strict=True)
-        index_by_point = {(round(float(x), 4), round(float(y), 4)): k for k, (x, y) in enumerate(scan_points)}
-        points = [(round(x, 4), round(y, 4)) for x, y in points]
+        x, y = (np.round(values, 4).tolist() for values in (term.x or robot.scan_x, term.y or robot.scan_y))
+        points = [(a, b) for b in y for a in x] if term.order == "x fastest" else [(a, b) for a in x for b in y]
+        robot_points = [*map(tuple, np.round(np.transpose(robot.scan_points()).astype(float), 4).tolist())]
         if not points:
             self._refuse("a scan must have x and y where the robot has no scan_x and scan_y")
-        if not set(points) <= index_by_point.keys():
-            x, y = ([*dict.fromkeys(values)] for values in zip(*points, strict=True))
-            remedy = f"write into robot.toml scan_x = {x} and scan_y = {y}"
+        if not {*points} <= {*robot_points}:
+            remedy = f"write into robot.toml scan_x = {[*dict.fromkeys(x)]} and scan_y = {[*dict.fromkeys(y)]}"
             self._refuse(f"the scan's points are not those of the robot: {remedy}")
-        return [index_by_point[point] for point in points]
+        return [robot_points.index(point) for point in points]
 
     @property
     def graph_safe(self) -> bool:

@@ -57,16 +57,12 @@ class ControllerSpec:
     @property
     def files(self) -> tuple[Path, ...]:
         """The Python file, the controller's file, and the files of its network, if any."""
-        files = [Path(self.module)] if self.module is not None and self.module.endswith(".py") else []
-        if self.file is not None:
-            networks = [Path(self.file)]
-            files += networks
-            if networks[0].suffix == ".toml":
-                networks = [*filter(None, (weights_file(files[-1], key) for key in ("policy", "encoder")))]
-                files += networks
-            for network in networks:
-                files += filter(None, [agent_file(network), data_file(network)])
-        return tuple(files)
+        code = [Path(self.module)] if self.module is not None and self.module.endswith(".py") else []
+        files = [Path(self.file)] if self.file is not None else []
+        if self.file is not None and files[0].suffix == ".toml":
+            files += filter(None, (weights_file(files[0], key) for key in ("policy", "encoder")))
+        beside = [find(file) for file in files for find in (agent_file, data_file)]
+        return (*code, *files, *filter(None, beside))
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
         """The same with its files in another folder."""
@@ -94,11 +90,12 @@ def agent_file(weights: Path) -> Path | None:
 
 def data_file(weights: Path) -> Path | None:
     """The file beside an .onnx file that holds its weights, if it names one."""
-    if weights.suffix.lower() != ".onnx":
-        return None
-    from sim.controllers.formats.onnx_data import find_data_file  # onnx takes a moment to load
+    if weights.suffix.lower() == ".onnx":
+        from sim.controllers.formats.onnx_data import find_data_file  # onnx takes a moment to load
 
-    return find_data_file(weights)
+        with suppress(OSError, ValueError):  # loading it says so
+            return find_data_file(weights)
+    return None
 
 
 def resolve_policy(policy: str, robot: RobotCfg) -> str:

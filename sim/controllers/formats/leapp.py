@@ -63,9 +63,8 @@ class Leapp:
         source.set(action_scale=1.0, action_offset=[0.0] * len(joints))
         for column, (kind, name) in enumerate(_GAINS.items(), start=1):
             values = _read_model_gains(source.model, column)
-            values |= (
-                dict(zip(joints, _read_constant(data, outputs[kind]["name"]), strict=True)) if kind in outputs else {}
-            )
+            if kind in outputs:
+                values |= zip(joints, _read_constant(data, outputs[kind]["name"]), strict=True)
             without = [joint for joint in source.joints if joint not in values]
             gap = f"a value of each joint: {to_toml(values)}; none is said of {', '.join(without)}" * bool(without)
             source.set(**{name: None if gap else collapse([*map(values.get, source.joints)])}, reason=gap)
@@ -104,9 +103,8 @@ def _read_constant(data: bytes, name: str) -> list[float]:
     feeds = [{port.name: rng.normal(size=port.shape).astype("f4") for port in session.get_inputs()} for _ in range(2)]
     first, second = (np.asarray(session.run([name], feed)[0]) for feed in feeds)
     if not np.array_equal(first, second):
-        raise ValueError(
-            f"its output {name} must be constant, got values that follow its inputs: they are not simulated"
-        )
+        got = "values that follow its inputs: they are not simulated"
+        raise ValueError(f"its output {name} must be constant, got {got}")
     return first.ravel().astype(float).round(6).tolist()
 
 

@@ -62,9 +62,8 @@ def find_widths(network: Any) -> tuple[int | None, int | None]:
         return network.sizes
     for weight in network.parameters():
         with suppress(Exception):  # of an inner layer
-            return weight.shape[1], _take_actions(network(torch.zeros(1, weight.shape[1], device=weight.device))).shape[
-                1
-            ]
+            rows = torch.zeros(1, weight.shape[1], device=weight.device)
+            return rows.shape[1], _take_actions(network(rows)).shape[1]
     return None, None
 
 

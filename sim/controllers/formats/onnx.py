@@ -279,25 +279,22 @@ def export_onnx(policy: MlpPolicy, path: Path) -> None:
     if policy.activation not in _OPERATORS:
         raise ValueError(f"ONNX of opset {_OPSET} has no {policy.activation}, only {', '.join(_OPERATORS)}")
     prepare_output(path)
-    nodes: list[Any] = []
-    weights: list[Any] = []
-
-    def node(kind: str, value: str, name: str, tensors: dict[str, torch.Tensor], **attributes: Any) -> str:
-        nodes.append(helper.make_node(kind, [value, *tensors], [name], name=f"make_{name}", **attributes))
-        arrays = {key: tensor.detach().cpu().float().contiguous().numpy() for key, tensor in tensors.items()}
-        weights.extend(numpy_helper.from_array(array, key) for key, array in arrays.items())
-        return name
-
-    value = "observation"
+    steps: list[tuple[str, str, dict[str, torch.Tensor]]] = []
     if policy.normalised:  # the 1e-2 is rsl_rl's
-        value = node("Sub", value, "centred", {"mean": policy.mean})
-        value = node("Div", value, "normalised", {"scale": policy.std + 1e-2})
+        steps = [("Sub", "centred", {"mean": policy.mean}), ("Div", "normalised", {"scale": policy.std + 1e-2})]
     for k, layer in enumerate(policy.layers):
         name = "action" if k == len(policy.layers) - 1 else f"layer_{k}"
-        if isinstance(layer, torch.nn.Linear):
-            value = node("Gemm", value, name, {f"weight_{k}": layer.weight, f"bias_{k}": layer.bias}, transB=1)
-        else:
-            value = node(_OPERATORS[policy.activation], value, name, {})
+        tensors: dict[str, torch.Tensor] = {f"{key}_{k}": value for key, value in layer.named_parameters()}
+        steps.append(("Gemm" if tensors else _OPERATORS[policy.activation], name, tensors))
+    nodes: list[Any] = []
+    weights: list[Any] = []
+    value = "observation"
+    for kind, name, tensors in steps:
+        attributes: dict[str, Any] = {"transB": 1} if kind == "Gemm" else {}
+        nodes.append(helper.make_node(kind, [value, *tensors], [name], name=f"make_{name}", **attributes))
+        arrays = {key: tensor.detach().cpu().float().contiguous().numpy() for key, tensor in tensors.items()}
+        weights += [numpy_helper.from_array(array, key) for key, array in arrays.items()]
+        value = name
     ends = zip(("observation", "action"), policy.sizes, strict=True)
     ports = [[helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])] for name, size in ends]
     graph = helper.make_graph(nodes, "policy", *ports, initializer=weights)

@@ -10,20 +10,20 @@ from onnx import TensorProto, helper
 
 
 def find_data_file(path: Path) -> Path | None:
-    """The file beside an ONNX file that it names for its weights; None if it names none, or is no ONNX file."""
-    try:
-        return _check_data_file(path, _read_graph(path)[1])
-    except (OSError, ValueError):  # loading it says so
-        return None
+    """The one file beside an ONNX file that it names for its weights; None if it names none."""
+    outside = _read_graph(path)[1]
+    names = {field.value for tensor in outside for field in tensor.external_data if field.key == "location"}
+    file = path.parent / next(iter(names), "")
+    if outside and ({file.name} != names or file.resolve().parent != path.parent.resolve()):
+        raise ValueError(f"it must keep its tensors in one file beside it, got {len(outside)} in {', '.join(names)}")
+    return file if outside else None
 
 
 def read_onnx(path: Path) -> tuple[Any, bytes]:
     """The graph of a file with all its weights, and its bytes; a ValueError if any are not in the file beside it."""
     model, outside = _read_graph(path)
-    file = _check_data_file(path, outside)
-    if file is None:
-        return model, path.read_bytes()
-    data = file.read_bytes()
+    file = find_data_file(path)
+    data = file.read_bytes() if file else b""
     for tensor in outside:
         fields = {field.key: field.value for field in tensor.external_data}
         size = int(np.prod(tensor.dims)) * helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
@@ -34,7 +34,7 @@ def read_onnx(path: Path) -> tuple[Any, bytes]:
         tensor.raw_data = data[start : start + size]
         tensor.data_location = TensorProto.DEFAULT
         del tensor.external_data[:]
-    return model, model.SerializeToString()
+    return model, model.SerializeToString() if outside else path.read_bytes()
 
 
 def read_metadata(path: Path) -> dict[str, str]:
@@ -51,21 +51,11 @@ def _read_graph(path: Path) -> tuple[Any, list[Any]]:
     return model, [tensor for tensor in _tensors(model) if tensor.external_data or tensor.data_location]
 
 
-def _check_data_file(path: Path, outside: list[Any]) -> Path | None:
-    """The one file beside ``path`` that tensors name."""
-    names = {field.value for tensor in outside for field in tensor.external_data if field.key == "location"}
-    file = path.parent / next(iter(names), "")
-    if outside and ({file.name} != names or file.resolve().parent != path.parent.resolve()):
-        raise ValueError(f"it must keep its tensors in one file beside it, got {len(outside)} in {', '.join(names)}")
-    return file if outside else None
-
-
 def _tensors(message: Any) -> Iterator[Any]:
     """Every tensor in a model, those in subgraphs and attributes included."""
     if message.DESCRIPTOR.full_name == "onnx.TensorProto":
         yield message
         return
-    for field, value in message.ListFields():
-        if field.message_type is not None:
-            for inner in [value] if hasattr(value, "DESCRIPTOR") else value:
-                yield from _tensors(inner)
+    for inner in [value for field, value in message.ListFields() if field.message_type is not None]:
+        for part in [inner] if hasattr(inner, "DESCRIPTOR") else inner:
+            yield from _tensors(part)

@@ -14,7 +14,7 @@ from sim.controllers.described import read_controller
 from sim.controllers.imports import import_controller
 from sim.controllers.loaders import load_policy
 from sim.robots.find import get_robot
-from tests.sim.controllers.test_onnx import graph_model, linear, make_nodes, port
+from tests.sim.controllers.test_onnx import linear, parse
 from tests.sim.dogs import JOINTS, mjcf
 
 RIGHT_FIRST = ["FR_hip", "FR_knee", "FL_hip", "FL_knee", "HR_hip", "HR_knee", "HL_hip", "HL_knee"]
@@ -217,12 +217,17 @@ def deploy(folder, *changes):
 
 def leapp(folder, kp="gains", **changes):
     """Targets that follow half of the angle off a pose, of joints in another order, and a state."""
-    nodes = make_nodes(
-        f"Add {kp} half > kp", "Identity gains > kd", "Add past half > past_out", "Sub joint_pos pose > off",
-        "Mul off half > action", "Add action pose > targets",
-    )  # fmt: skip
-    numbers = {"pose": np.float32(POSE), "half": np.float32([0.5]), "gains": np.full((1, 8), 20.0, "f4")}
-    weights = [onnx.numpy_helper.from_array(value, name) for name, value in numbers.items()]
+    text = f"""(float[1, 4] quat_w, float[1, 8] joint_pos, float[1, 8] past)
+        => (float[1, 8] targets, float[1, 8] past_out, float[1, 8] kp, float[1, 8] kd) {{
+        kp = Add({kp}, half)
+        kd = Identity(gains)
+        past_out = Add(past, half)
+        off = Sub(joint_pos, pose)
+        action = Mul(off, half)
+        targets = Add(action, pose)
+    }}"""
+    model = parse(text, pose=np.float32(POSE), half=np.float32([0.5]), gains=np.full((1, 8), 20.0, "f4"))
+    onnx.save(model, folder / "policy.onnx")
     kinds = {"quat_w": "state/body/rotation", "joint_pos": "state/joint/position", "past": None,
              "targets": "target/joint/position", "past_out": None, "kp": "kp", "kd": "kd"}  # fmt: skip
     names = {"quat_w": [list("xyzw")]}
@@ -230,8 +235,6 @@ def leapp(folder, kp="gains", **changes):
         {"name": name, "kind": kind, "element_names": names.get(name, [RIGHT_FIRST]), "is_state": kind is None}
         for name, kind in kinds.items()
     ]
-    ports = [port(name, [1, 4 if name == "quat_w" else 8]) for name in kinds]
-    onnx.save(graph_model(nodes, ports[:3], ports[3:], weights), folder / "policy.onnx")
     digest = hashlib.sha256((folder / "policy.onnx").read_bytes()).hexdigest()
     parameters = {"model_path": "policy.onnx", "sha256sum": digest}
     model = {"inputs": items[:3], "outputs": items[3:], "parameters": parameters} | changes

@@ -1,11 +1,11 @@
 """Controllers in ONNX files: they act as their weights say, and what does not fit is refused; and their export."""
 
 import numpy as np
-import onnx
+import onnx.parser
 import onnxruntime
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import numpy_helper
 
 from sim.controllers.formats.onnx import export_onnx, load_onnx
 from sim.controllers.formats.rsl_rl import MlpPolicy
@@ -16,29 +16,19 @@ from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor
 from tests.sim.controllers.test_loaders import runner_on
 
 
-def port(name, shape, kind=TensorProto.FLOAT):
-    return helper.make_tensor_value_info(name, kind, shape)
-
-
-def graph_model(nodes, inputs, outputs, weights=()):
-    graph = helper.make_graph(list(nodes), "policy", inputs, outputs, initializer=list(weights))
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-
-
-def make_nodes(*steps):
-    """Nodes from texts such as ``Sub rows mean > centred``."""
-    ends = [[end.split() for end in step.split(" > ")] for step in steps]
-    return [helper.make_node(kind, inputs, outputs) for (kind, *inputs), outputs in ends]
+def parse(text, **weights):
+    """A graph in ONNX's own text, with these weights."""
+    model = onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["": 17]> policy {text}')
+    model.graph.initializer.extend(numpy_helper.from_array(np.array(value), key) for key, value in weights.items())
+    return model
 
 
 def linear(observations=OBSERVATIONS, actions=ACTIONS, batch="batch", columns=None, bias=None):
     """One layer, as a foreign exporter would write it: other names than ours."""
     weight = np.random.default_rng(3).normal(size=(actions, observations)).astype(np.float32) / 10
-    offset = np.linspace(-1, 1, actions, dtype="f4")
-    weights = [numpy_helper.from_array(weight, "w"), numpy_helper.from_array(offset if bias is None else bias, "b")]
-    node = helper.make_node("Gemm", ["obs", "w", "b"], ["actions"], transB=1)
-    ports = [port("obs", [batch, columns or observations])], [port("actions", [batch, columns or actions])]
-    return graph_model([node], *ports, weights)
+    offset = np.linspace(-1, 1, actions, dtype="f4") if bias is None else bias
+    ports = f"(float[{batch}, {columns or observations}] obs) => (float[{batch}, {columns or actions}] actions)"
+    return parse(f"{ports} {{ actions = Gemm<transB = 1>(obs, w, b) }}", w=weight, b=offset)
 
 
 def chain(last, bound=False):
@@ -50,16 +40,18 @@ def chain(last, bound=False):
     width = OBSERVATIONS
     shapes = {"mean": width, "factor": width, "w0": (width, 16), "b0": 16, "w1": (16, 24), "b1": 24}
     weights = {name: rng.normal(size=shape).astype(np.float32) / 5 for name, shape in shapes.items()}
-    weights["size"] = np.array([1, width])
-    steps = (
-        "Reshape obs size > raw" if bound else "Identity obs > raw", "Sub raw mean > centred",
-        "Mul centred factor > rows", "Gemm rows w0 b0 > hidden", "Sigmoid hidden > gate",
-        "Mul hidden gate > swish", "Gemm swish w1 b1 > out", "Split out > mode spread", f"{last} mode > actions",
-    )  # fmt: skip
-    nodes = make_nodes(*steps)
-    nodes[-2].attribute.append(helper.make_attribute("axis", -1))
-    tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
-    return graph_model(nodes, [port("obs", [1, width])], [port("actions", [1, ACTIONS])], tensors), weights
+    text = f"""(float[1, {width}] obs) => (float[1, {ACTIONS}] actions) {{
+        raw = {"Reshape(obs, size)" if bound else "Identity(obs)"}
+        centred = Sub(raw, mean)
+        rows = Mul(centred, factor)
+        hidden = Gemm(rows, w0, b0)
+        gate = Sigmoid(hidden)
+        swish = Mul(hidden, gate)
+        out = Gemm(swish, w1, b1)
+        mode, spread = Split<axis = -1>(out)
+        actions = {last}(mode)
+    }}"""
+    return parse(text, size=[1, width], **weights), weights
 
 
 def save(path, model):
@@ -100,29 +92,20 @@ def test_a_graph_that_knows_of_one_robot_runs_once_a_robot(tmp_path, anymal):
     torch.testing.assert_close(bound(rows_of(7)), known(rows_of(7)), rtol=1e-4, atol=1e-4)
 
 
-def identity(**shapes):
-    """A graph that returns its inputs, each of them called ``..._x``."""
-    nodes = [helper.make_node("Identity", [name], [f"{name}_x"]) for name in shapes]
-    return graph_model(nodes, *([port(name + end, *of) for name, of in shapes.items()] for end in ("", "_x")))
-
-
 @pytest.mark.filterwarnings("ignore:policy.*one robot after the other")
 @pytest.mark.parametrize("batch", ["n", 1])
 @pytest.mark.parametrize("last", ["Identity", "Softsign"])
 def test_inputs_are_columns_of_the_row_states_come_back_and_other_outputs_are_named(tmp_path, batch, last):
-    sizes = {"start": [1], "end": [2], "axis": [1]}
-    nodes = [
-        helper.make_node("Slice", ["past", "start", "end", "axis"], ["newer"]),  # past: (batch, 2, 3)
-        helper.make_node("Unsqueeze", ["speed", "axis"], ["now"]),
-        helper.make_node("Concat", ["newer", "now"], ["past_out"], axis=1),
-        helper.make_node("ReduceMean", ["past_out"], ["mean"], axes=[1], keepdims=0),
-        helper.make_node("Concat", ["command", "mean"], ["both"], axis=-1),
-        helper.make_node(last, ["both"], ["actions"]),
-    ]
-    shapes = {"command": [batch, 2], "past": [batch, 2, 3], "speed": [batch, 3]}
-    outputs = {"mean": [batch, 3], "past_out": [batch, 2, 3], "actions": [batch, 5]}
-    ports = [[port(*item) for item in items.items()] for items in (shapes, outputs)]
-    model = graph_model(nodes, *ports, [numpy_helper.from_array(np.array(v), name) for name, v in sizes.items()])
+    text = f"""(float[{batch}, 2] command, float[{batch}, 2, 3] past, float[{batch}, 3] speed)
+        => (float[{batch}, 3] mean, float[{batch}, 2, 3] past_out, float[{batch}, 5] actions) {{
+        newer = Slice(past, start, end, axis)
+        now = Unsqueeze(speed, axis)
+        past_out = Concat<axis = 1>(newer, now)
+        mean = ReduceMean<axes = [1], keepdims = 0>(past_out)
+        both = Concat<axis = -1>(command, mean)
+        actions = {last}(both)
+    }}"""
+    model = parse(text, start=[1], end=[2], axis=[1])
     with pytest.warns(UserWarning, match=r"policy\.onnx' returns more than actions: mean"):
         policy = load_onnx(save(tmp_path / "policy.onnx", model), (5, 5), "cpu")
     assert is_graph_safe(policy) == (last == "Identity")
@@ -140,19 +123,18 @@ MODELS = {
     "another robot's rows, of unknown width": linear(48, columns="columns"),
     "a batch of four": linear(batch=4),
     "NaN": linear(bias=np.full(ACTIONS, np.nan, np.float32)),
-    "no batch": identity(obs=([12],)),
-    "doubles": identity(obs=(["b", 12], TensorProto.DOUBLE)),
-    "no state that comes out": identity(obs=(["n", OBSERVATIONS],), h_in=([1, "n", 3],)),
-    "rows that are mixed": graph_model(
-        [helper.make_node("CumSum", ["obs", "axis"], ["sums"]), helper.make_node("Gemm", ["sums", "w"], ["a"])],
-        [port("obs", ["n", OBSERVATIONS])],
-        [port("a", ["n", ACTIONS])],
-        [
-            numpy_helper.from_array(np.array(0), "axis"),
-            numpy_helper.from_array(np.eye(OBSERVATIONS, 12, dtype="f4"), "w"),
-        ],
+    "no batch": parse("(float[12] obs) => (float[12] actions) { actions = Identity(obs) }"),
+    "doubles": parse("(double[n, 12] obs) => (double[n, 12] actions) { actions = Identity(obs) }"),
+    "no state that comes out": parse(
+        "(float[n, 235] obs, float[1, n, 3] h_in) => (float[n, 235] obs_x, float[1, n, 3] h_x) "
+        "{ obs_x = Identity(obs) h_x = Identity(h_in) }"
     ),
-    "no graph": graph_model([], [], []),
+    "rows that are mixed": parse(
+        "(float[n, 235] obs) => (float[n, 12] actions) { sums = CumSum(obs, axis) actions = Gemm(sums, w) }",
+        axis=0,
+        w=np.eye(OBSERVATIONS, ACTIONS, dtype="f4"),
+    ),
+    "no graph": parse("() => () {}"),
     "half a file": linear().SerializeToString()[:-9],
 }
 
