@@ -5,8 +5,8 @@ A contract is what controller.toml and robot.toml say. Networks walk best by tha
 
 import itertools
 import re
-from collections.abc import Iterator
-from dataclasses import MISSING, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from qd.workers.compute import Compute
 from sim.controllers.described import ControllerCfg, Described, Term, read_controller
+from sim.controllers.formats.source import collapse
 from sim.controllers.spec import weights_file
 from sim.files.settings import to_toml
 from sim.robots.compiled import read_drives, read_robot_file, robot_spec
@@ -24,7 +25,7 @@ from sim.trials import MEASURES, Variant, walk_variants
 _FIRST_S, _SECOND_S = 3.6, 4.5  # time that robots walk in the two rounds [s]
 _KEPT = 16  # changes in the second round
 _EPISODES = {"cuda": (4, 16), "cpu": (1, 4)}  # of each change in the two rounds
-_UNLIKELY = re.compile(r"command x \(| and \w+ x|beside|signs of (.|...) of")
+_UNLIKELY = re.compile(r"command x \(| and \w+ x|signs of (.|...) of")
 """Changes that need more evidence: of two things at once, and of a sensor's axes that no turn of it makes."""
 _LEAST_GAIN = 0.03  # of the score for which a change is named
 _WEIGHTS = {"roll_pitch_rate": 0.2, "tilt": 2.0, "action_rate": 0.4, "action": 0.05, "power": 0.4}
@@ -32,7 +33,7 @@ _WEIGHTS = {"roll_pitch_rate": 0.2, "tilt": 2.0, "action_rate": 0.4, "action": 0
 _FACTORS = (0.05, 0.25, 0.5, 2.0, 4.0, 20.0, -1.0)
 _ALL_PAIRS = 16  # joints up to which all pairs of them are swapped
 _LIMB = re.compile(r"(?i)(?<![a-z])(fl|fr|rl|rr|hl|hr|lf|rf|lh|rh|left|right|l|r)(?![a-z])")
-_GAINS = ("stiffness", "damping", "effort_limit", "armature")
+_GAINS = ("stiffness", "damping", "armature")
 
 
 class Change(NamedTuple):
@@ -47,28 +48,33 @@ class Change(NamedTuple):
 def write_out(cfg: ControllerCfg, robot: RobotCfg) -> ControllerCfg:
     """The description with what it leaves out: joints, pose, and a number for each column and joint."""
     joints = cfg.joints or robot.joint_names
-    pose = dict(zip(robot.joint_names, robot.default_joint_pos, strict=True))
     widths = Described(cfg, robot, "controller.toml").widths
     terms = [
-        replace(term, scale=tuple(np.broadcast_to(term.scale, width).astype(float).tolist()))
+        replace(term, scale=_times(term.scale, np.ones(width)))
         for term, width in zip(cfg.observation, widths, strict=True)
     ]
-    scale = tuple(np.broadcast_to(cfg.action_scale, len(joints)).astype(float).tolist())
-    default = cfg.default or tuple(pose[name] for name in joints)
+    default = cfg.default or _select(robot.default_joint_pos, robot, joints)
+    scale = _times(cfg.action_scale, np.ones(len(joints)))
     return replace(cfg, joints=joints, default=default, action_scale=scale, observation=tuple(terms))
 
 
 def propose_changes(base: Variant) -> list[Change]:
     """Changes of one thing each, without those that change nothing; the description of ``base`` is written out."""
-    descriptions = itertools.chain(_change_terms(base.controller), _change_actions(base.controller, base.robot))
-    variants = [(text, replace(base, controller=cfg)) for text, cfg in descriptions]
-    changes = [Change(*change) for change in [*variants, *_change_drives(base)] if change[1] != base]
-    first = {repr(change.variant): change for change in changes[::-1]}  # of those that come twice
-    return [*first.values()][::-1]
+    cfg, changes = base.controller, dict[str, Change]()
+    descriptions = (*_change_terms(cfg), *_change_actions(cfg, base.robot))
+    variants = [(text, replace(base, controller=changed)) for text, changed in descriptions]
+    for text, variant in (*variants, *_change_drives(base)):
+        if variant != base:
+            changes.setdefault(repr(variant), Change(text, variant))
+    return [*changes.values()]
 
 
 def _times(values: Any, factors: Any) -> tuple[float, ...]:
-    return tuple((np.array(values) * factors + 0.0).tolist())
+    return tuple((np.array(values, float) * factors + 0.0).tolist())
+
+
+def _select(pose: Sequence[float], robot: RobotCfg, joints: Sequence[str]) -> tuple[float, ...]:
+    return tuple(float(pose[robot.joint_names.index(name)]) for name in joints)
 
 
 def _scale_term(cfg: ControllerCfg, k: int, factors: Any) -> ControllerCfg:
@@ -109,13 +115,7 @@ def _change_actions(cfg: ControllerCfg, robot: RobotCfg) -> Iterator[tuple[str, 
         yield "action_delay_steps", replace(cfg, action_delay_steps=steps)
     home = read_robot_file(robot.model_file).home
     for pose in filter(None, (robot.default_joint_pos, home, (0.0,) * robot.num_joints)):
-        values = tuple(float(pose[robot.joint_names.index(name)]) for name in joints)
-        for name, angles, offset in (
-            ("default", values, cfg.action_offset),
-            ("default beside action_offset", values, cfg.action_offset or default),
-            ("action_offset", default, values),
-        ):
-            yield name, replace(cfg, default=angles, action_offset=None if offset == angles else offset)
+        yield "default", replace(cfg, default=_select(pose, robot, joints))
     for j, joint in enumerate(joints):
         flip = np.where(np.arange(count) == j, -1.0, 1.0)
         yield f"sign of the action of {joint}", replace(cfg, action_scale=_times(scale, flip))
@@ -146,11 +146,11 @@ def _change_actions(cfg: ControllerCfg, robot: RobotCfg) -> Iterator[tuple[str, 
 def _change_drives(base: Variant) -> Iterator[tuple[str, Variant]]:
     """Gains, limits and delay of drives, and time steps."""
     robot = base.robot
-    has_gain = [np.isfinite(values).all() and values.any() for values in _read_gains(robot)]
-    for changed, factor in itertools.product(((0,), (1,), (0, 1), (2,), (3,)), (0.5, 2.0)):
-        gains = tuple(gain * factor if k in changed else gain for k, gain in enumerate(base.gains))
-        if all(has_gain[k] for k in changed):
-            yield f"{' and '.join(_GAINS[k] for k in changed)} x {factor}", replace(base, gains=gains)
+    for changed, factor in itertools.product((*_GAINS, "stiffness and damping"), (0.5, 2.0)):
+        names = changed.split(" and ")
+        if all(_read_gains(robot)[name].any() for name in names):
+            factors = [factor if name in names else 1.0 for name in _GAINS]
+            yield f"{changed} x {factor}", replace(base, gains=_times(base.gains, factors))
     for steps in (0, max(robot.decimation // 2, 1), robot.decimation, 2 * robot.decimation):
         yield "drive_delay_steps", replace(base, robot=replace(robot, drive_delay_steps=steps))
     for decimation in (robot.decimation / 2.0, 2.0 * robot.decimation):
@@ -158,39 +158,35 @@ def _change_drives(base: Variant) -> Iterator[tuple[str, Variant]]:
             yield "decimation", replace(base, robot=replace(robot, decimation=int(decimation)))
 
 
-def _read_gains(robot: RobotCfg) -> tuple[NDArray[np.float64], ...]:
-    """Of each joint, in the order of :data:`_GAINS`."""
+def _read_gains(robot: RobotCfg) -> dict[str, NDArray[np.float64]]:
+    """Of each joint, by the names of :data:`_GAINS`; those of an actuator network are none."""
     model = robot_spec(robot).compile()
     drives = read_drives(model)
-    return drives.stiffness, drives.damping, drives.effort, model.dof_armature[6:]
+    gains = np.array([drives.stiffness, drives.damping]) * (robot.actuator_net is None)
+    return dict(zip(_GAINS, (*gains, model.dof_armature[6:]), strict=True))
 
 
 def rank_changes(base: Variant, weights: Path, *, device: str) -> list[Change]:
     """Lets robots walk with each change, and longer with the best; those, the best first, ``nothing`` among them."""
     base = replace(base, controller=write_out(base.controller, base.robot))
     changes = [Change("nothing", base), *propose_changes(base)]
-    variants = [change.variant for change in changes]
-    once, again = _EPISODES["cuda" if device.startswith("cuda") else "cpu"]
-    walks = walk_variants(variants, weights, device=device, seconds=_FIRST_S, replicas=once)
-    scores = [
-        float(np.mean(score_walks(walk, change.variant.robot))) for walk, change in zip(walks, changes, strict=True)
-    ]
-    best = sorted({0, *np.argsort(-np.array(scores), kind="stable")[:_KEPT].tolist()})
-    variants = [variants[k] for k in best]
-    walks = walk_variants(variants, weights, device=device, seconds=_SECOND_S, replicas=again, seed=1)
-    ranked = []
-    for k, walk in zip(best, walks, strict=True):
-        score = float(np.mean(score_walks(walk, changes[k].variant.robot)))
-        score -= 0.02 * bool(_UNLIKELY.search(changes[k].text))
-        ranked.append(changes[k]._replace(score=score, measures=np.nan_to_num(walk).mean(axis=0)))
-    return sorted(ranked, key=lambda change: -change.score)
+    timed = zip((_FIRST_S, _SECOND_S), _EPISODES["cuda" if device.startswith("cuda") else "cpu"], strict=True)
+    for seed, (seconds, episodes) in enumerate(timed):
+        least = sorted(change.score for change in changes)[-_KEPT:][0]
+        changes = [change for change in changes if change.score >= least or change.variant == base]
+        variants = [change.variant for change in changes]
+        walks = walk_variants(variants, weights, device=device, seconds=seconds, replicas=episodes, seed=seed)
+        for k, (change, walk) in enumerate(zip(changes, walks, strict=True)):
+            score = score_walks(walk, base.robot) - 0.02 * bool(_UNLIKELY.search(change.text))
+            changes[k] = change._replace(score=score, measures=np.nan_to_num(walk).mean(axis=0))
+    return sorted(changes, key=lambda change: -change.score)
 
 
-def score_walks(walks: NDArray[np.float64], robot: RobotCfg) -> NDArray[np.float64]:
+def score_walks(walks: NDArray[np.float64], robot: RobotCfg) -> float:
     """How well episodes walk, by their measures (num_episodes, num_measures); more is better."""
-    costs = sum(_WEIGHTS[name] * values for name, values in zip(MEASURES, walks.T, strict=True) if name in _WEIGHTS)
-    costs += walks[:, MEASURES.index("velocity_error")] / robot.speed
-    return -5.0 * (1.0 - walks[:, 0]) - np.nan_to_num(costs, nan=8.0)
+    weights = {**_WEIGHTS, "velocity_error": 1.0 / robot.speed}
+    costs = sum(weight * walks[:, MEASURES.index(name)] for name, weight in weights.items())
+    return float(np.mean(-5.0 * (1.0 - walks[:, 0]) - np.nan_to_num(costs, nan=8.0)))
 
 
 def explain_walk(robot: RobotCfg, policy: str, compute: Compute) -> None:
@@ -232,42 +228,36 @@ def describe_ranked(base: Variant, ranked: list[Change]) -> Iterator[str]:
 
 def describe_setting(base: Variant, variant: Variant) -> str:
     """The lines to write where a variant differs from the base, and the file."""
-    settings: dict[str, Any] = {}
-    if variant.gains != base.gains:
-        values = _read_gains(base.robot)
-        changed = [k for k in range(4) if variant.gains[k] != base.gains[k]]
-        settings = {_GAINS[k]: _shorten((values[k] * variant.gains[k]).tolist()) for k in changed}
+    gains = _read_gains(base.robot)
+    factors = zip(_GAINS, variant.gains, base.gains, strict=True)
+    settings = {name: _shorten(gains[name] * factor) for name, factor, former in factors if factor != former}
     settings |= _differences(base.robot, variant.robot)
     if settings:
         return "in robot.toml write " + " and ".join(f"{name} = {to_toml(value)}" for name, value in settings.items())
     before = write_out(base.controller, base.robot)
-    lines = []
-    for name, value in _differences(before, variant.controller).items():
-        if name == "observation":
-            for k, (term, former) in enumerate(zip(value, before.observation, strict=True)):
-                if term != former:
-                    lines.append(f"as term {k + 1} of observation {to_toml(_plain(term))}")
-        else:
-            lines.append(f"{name} = {to_toml(_shorten(value) if name == 'action_scale' else _plain(value))}")
+    changed = _differences(before, variant.controller)
+    terms = zip(changed.pop("observation", before.observation), before.observation, strict=True)
+    lines = [
+        f"as term {k} of observation {to_toml(_plain(t))}" for k, (t, former) in enumerate(terms, 1) if t != former
+    ]
+    lines += [f"{name} = {to_toml(value)}" for name, value in _plain(changed).items()]
     return f"in controller.toml write {' and '.join(lines)}"
 
 
 def _differences(before: Any, after: Any) -> dict[str, Any]:
-    names = [field.name for field in fields(before)]
-    return {name: getattr(after, name) for name in names if getattr(after, name) != getattr(before, name)}
+    return {name: value for name, value in vars(after).items() if value != getattr(before, name)}
 
 
 def _plain(value: Any) -> Any:
-    """A term or history as a table, without what is left out."""
-    if not hasattr(value, "__dataclass_fields__"):
-        return value
-    named = {field.name: getattr(value, field.name) for field in fields(value)}
-    named |= {"scale": _shorten(named["scale"])} if "scale" in named else {}
-    defaults = {field.name: field.default for field in fields(value) if field.default is not MISSING}
-    return {name: content for name, content in named.items() if name not in defaults or content != defaults[name]}
+    """A term, a history or settings as a table, without what is left out."""
+    if is_dataclass(value):
+        defaults = {field.name: field.default for field in fields(value)}
+        return {name: item for name, item in _plain(vars(value)).items() if item != defaults[name]}
+    if isinstance(value, dict):
+        return {name: _shorten(item) if name.endswith("scale") else _plain(item) for name, item in value.items()}
+    return value
 
 
 def _shorten(values: Any) -> Any:
     """One number in place of as many equal ones."""
-    values = [float(f"{value:.6g}") for value in np.ravel(values)]
-    return values[0] if len({*values}) == 1 else values
+    return collapse([float(f"{value:.6g}") for value in np.ravel(values)])
