@@ -275,11 +275,14 @@ class CheckCommand(ControllerFlags, WorkerFlags):
     def execute(self) -> int:
         """Prints what was found; returns 1 if something has to be mended."""
         from qd.check import check_robot
-        from sim.controllers.trace import print_differences
+        from sim.controllers.trace import compare_log
 
         robot = get_robot(self.robot)
         if self.trace is not None:
-            return int(print_differences(self.trace, self.policy or str(robot.policy_file), robot))
+            policy = self.policy or str(robot.policy_file)
+            differences = compare_log(self.trace, policy, robot)
+            print("\n".join(differences) or f"{self.trace} agrees with {policy}.")
+            return int(bool(differences))
         compute = _compute(self)
         return 0 if check_robot(robot, self.policy, compute=compute, why=self.why) else 1
 
