@@ -3,39 +3,70 @@
 import os
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sim.controllers.formats.booster import Booster
-from sim.controllers.formats.deploy_yaml import DeployYaml
-from sim.controllers.formats.holosoma import Holosoma
-from sim.controllers.formats.isaac_lab import IsaacLab
-from sim.controllers.formats.leapp import Leapp
-from sim.controllers.formats.legged_gym import LeggedGym
-from sim.controllers.formats.mjlab import Mjlab
-from sim.controllers.formats.rl_sar import RlSar
+from sim.controllers.formats.booster import read_booster
+from sim.controllers.formats.deploy_yaml import read_deploy_yaml
+from sim.controllers.formats.holosoma import read_holosoma
+from sim.controllers.formats.isaac_lab import read_isaac_lab
+from sim.controllers.formats.leapp import read_leapp
+from sim.controllers.formats.legged_gym import read_legged_gym
+from sim.controllers.formats.mjlab import read_mjlab
+from sim.controllers.formats.onnx_data import read_metadata
+from sim.controllers.formats.rl_sar import read_rl_sar
 from sim.controllers.formats.source import Source
-from sim.controllers.formats.unitree_rl_gym import UnitreeRlGym
-from sim.controllers.formats.weights import Weights
+from sim.controllers.formats.unitree_rl_gym import read_unitree_rl_gym
+from sim.controllers.formats.weights import read_weights_alone
 from sim.controllers.spec import data_file
 from sim.files.command import command_line
-from sim.files.settings import to_toml
+from sim.files.settings import YAML_SUFFIXES, read_yaml, to_toml
 from sim.robots.compiled import PER_JOINT
 from sim.robots.model_files import MENAGERIE, find_model, find_robot_of_scene
 from sim.robots.user import NEW_NAME, is_new_name
 
+_LAB = "a deployment of unitree_rl_lab or unitree_rl_mjlab (a folder with params/deploy.yaml, or that file)"
 FORMATS = (
-    *(IsaacLab(), DeployYaml(), UnitreeRlGym(), RlSar(), LeggedGym(), Booster(), Leapp()),
-    *(Mjlab(), Holosoma(), Weights()),
+    ({"params/env.yaml"}, read_isaac_lab, "a run of Isaac Lab (a folder with params/env.yaml)"),
+    ({"joint_ids_map"}, read_deploy_yaml, _LAB),
+    ({"kps"}, read_unitree_rl_gym, "a deployment of unitree_rl_gym (a YAML with kps, kds, ...)"),
+    ({"models", "pipeline"}, read_leapp, "a policy of LEAPP (its YAML)"),
+    ({"*.observations"}, read_rl_sar, "a controller of rl_sar (its YAML, or a folder with config.yaml)"),
+    ({"*.obs_scales"}, read_legged_gym, "a training of legged_gym (its configuration as YAML or JSON)"),
+    ({"*.gait_frequency"}, read_booster, "a controller of Booster Gym (the YAML of its deployment or training)"),
+    ({"observation_names"}, read_mjlab, "a controller of mjlab (an ONNX file with its metadata)"),
+    ({"dof_names", "kp", "kd"}, read_holosoma, "a controller of holosoma (an ONNX file with its metadata)"),
+    ({"weights"}, read_weights_alone, "weights alone (an rsl_rl checkpoint, TorchScript or ONNX)"),
 )
-"""Formats of sources: the first that matches a path reads it into a Source, and returns the file of the weights."""
-_ROBOT_SETTINGS = ("actuator_net", "drive_delay_steps", "physics_dt", "decimation", "speed", "max_duration_s")
-_ACTION_SETTINGS = ("policy", "joints", "action_scale", "action_offset", "action_clip")
-_OBSERVATION_SETTINGS = ("observation_clip", "activation", "history", "observation")
+"""Formats of sources: the first whose marks a path has reads it into a Source, and returns the file of the weights."""
 _SETTINGS_BY_FILE = {
-    "robot.toml": ("model_file", *PER_JOINT, *_ROBOT_SETTINGS, "scan_x", "scan_y"),
-    "controller.toml": (*_ACTION_SETTINGS, *_OBSERVATION_SETTINGS),
+    "robot.toml": (
+        *("model_file", *PER_JOINT, "actuator_net", "drive_delay_steps", "physics_dt", "decimation", "speed"),
+        *("max_duration_s", "scan_x", "scan_y"),
+    ),
+    "controller.toml": (
+        *("policy", "joints", "action_scale", "action_offset", "action_clip", "observation_clip", "activation"),
+        *("history", "observation"),
+    ),
 }
+
+
+def _list_marks(path: Path) -> set[str]:
+    """What formats are known by: keys of a file's content, those of its tables after ``*.``, and the name of a file."""
+    file = path
+    if path.is_dir():
+        files = [path / name for name in ("params/env.yaml", "params/deploy.yaml", "config.yaml")]
+        file = next(filter(Path.is_file, files), path)
+    if file.suffix == ".onnx":
+        return {"weights", *read_metadata(file)}
+    if file.is_file() and file.suffix not in (*YAML_SUFFIXES, ".json"):
+        return {"weights"}
+    marks = {file.relative_to(path).as_posix()}
+    if file.is_file() and "params/env.yaml" not in marks:  # which is long, and there is no other
+        content = read_yaml(file)
+        marks |= {*content}.union(*(map("*.{}".format, table) for table in content.values() if isinstance(table, dict)))
+    return marks
 
 
 def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
@@ -53,10 +84,11 @@ def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
     if not path.exists():
         raise ValueError(f"{path} is not there: expected a folder, a YAML, or weights")
     source = Source(file=path, model_file=None if model is None else find_robot_of_scene(find_model(model)))
-    source_format: Any = next((source_format for source_format in FORMATS if source_format.matches(path)), None)
-    if source_format is None:
-        raise ValueError(f"{path} must be {', or '.join(source_format.label for source_format in FORMATS)}")
-    weights_file = _read(source_format, path, source)
+    marks = _list_marks(path)
+    reader, label = next(((reader, label) for needed, reader, label in FORMATS if needed <= marks), (None, ""))
+    if reader is None:
+        raise ValueError(f"{path} must be {', or '.join(label for *_, label in FORMATS)}")
+    weights_file = _read(reader, label, path, source)
     copies = {file: out / file.name for file in (weights_file, data_file(weights_file)) if file is not None}
     for file, copy in copies.items():
         if copy.exists() and copy.read_bytes() != file.read_bytes():
@@ -66,7 +98,7 @@ def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
     is_named = model_file is None or str(model).startswith(MENAGERIE)
     model_setting = str(model) if is_named else os.path.relpath(model_file.resolve(), out.resolve())
     source.set(model_file=Path(model_setting), policy=weights_file.name)
-    print(f"{path} is read as {source_format.label}; its weights are {weights_file}, its model is {model_file}.")
+    print(f"{path} is read as {label}; its weights are {weights_file}, its model is {model_file}.")
     for file, copy in copies.items():
         if not copy.exists():
             shutil.copyfile(file, copy)
@@ -82,10 +114,10 @@ def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
     return not gaps
 
 
-def _read(source_format: Any, path: Path, source: Source) -> Path:
+def _read(reader: Callable[[Path, Source], Path], label: str, path: Path, source: Source) -> Path:
     """The file of the weights; errors name the source and its format."""
     try:
-        return source_format.read(path, source)
+        return reader(path, source)
     except (ArithmeticError, AttributeError, LookupError, StopIteration, TypeError, ValueError, re.error) as error:
         files = {str(source.file), str(source.model_file)}
         if isinstance(error, ValueError) and any(file in str(error) for file in files):
@@ -93,7 +125,7 @@ def _read(source_format: Any, path: Path, source: Source) -> Path:
         problem = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         if not isinstance(error, KeyError | ValueError):
             problem = f"it is laid out otherwise ({type(error).__name__}: {error})"
-        raise ValueError(f"{path} must be {source_format.label}, but {problem}") from None
+        raise ValueError(f"{path} must be {label}, but {problem}") from None
 
 
 def _format_setting(name: str, source: Source) -> str:

@@ -5,68 +5,59 @@ from typing import Any
 
 from sim.controllers.formats.isaac_lab import ISAAC_LAB_TERMS, read_action, read_term
 from sim.controllers.formats.source import Source, collapse, find_checkpoint
-from sim.files.settings import YAML_SUFFIXES, read_yaml
+from sim.files.settings import read_yaml
 
 _FUNCTIONS = {name: name for name in ISAAC_LAB_TERMS if name != "height_scan"}
 _FUNCTIONS["velocity_commands"] = "generated_commands"
 _STEPS = 4  # physics steps a control step, in the tasks of both
 
 
-class DeployYaml:
-    """Reads a deploy.yaml, which numbers the joints by the motors of Unitree's SDK and does not name them."""
+def read_deploy_yaml(path: Path, source: Source) -> Path:
+    """Settings of a deploy.yaml, which numbers the joints by the motors of Unitree's SDK; the model names them.
 
-    label = "a deployment of unitree_rl_lab or unitree_rl_mjlab (a folder with params/deploy.yaml, or that file)"
-
-    def matches(self, path: Path) -> bool:
-        """Whether it is such a folder, or a YAML with a joint_ids_map."""
-        if path.is_dir():
-            return (path / "params" / "deploy.yaml").is_file()
-        return path.suffix in YAML_SUFFIXES and "joint_ids_map" in read_yaml(path)
-
-    def read(self, path: Path, source: Source) -> Path:
-        """Settings of the YAML, with the names of its joints by the model; returns the exported network."""
-        source.file = file = path / "params" / "deploy.yaml" if path.is_dir() else path
-        content = read_yaml(file)
-        motors = [int(motor) for motor in content.pop("joint_ids_map")]
-        if len(motors) != len(source.joints):
-            must = f"must number {len(source.joints)}, the joints of {source.model_file}"
-            raise ValueError(f"{file}: joint_ids_map {must}, got {len(motors)}")
-        joints = _find_order(motors, source)
-        for name in ("stiffness", "damping"):
-            gains = content[name]
-            slots = sorted(motors) if len(gains) == len(motors) else range(len(gains))  # motors that are not there
-            content[name] = [gains[slots.index(motor)] for motor in motors]
-        names = ("stiffness", "damping", "default_joint_pos")
-        default = dict(zip(joints, content["default_joint_pos"], strict=True))
-        source.move(content, dict(zip(names, names, strict=True)), joints)
-        reason = f"{file.name} says the control step alone; the tasks of its makers have {_STEPS} physics steps in it"
-        source.set(physics_dt=round(content.pop("step_dt") / _STEPS, 6), decimation=_STEPS, reason=reason)
-        actions = content.pop("actions")
-        for name, action in actions.items():
-            moved = _select_joints(action.get("joint_ids"), joints)
-            is_usual = action.get("offset") == [default[joint] for joint in moved]
-            action |= {"class_type": name, "joint_names": moved, "preserve_order": True, "use_default_offset": is_usual}
-        env = {"actions": actions, "scene": {"robot": {"joint_ordering": joints}}, "sim": {}}
-        read_action(env, file.parent, source, None)
-        reason = "the order in which the motors of a limb follow each other; joints are numbered, not named"
-        source.set(joints=source.settings.get("joints", joints), reason=reason)
-        terms = content.pop("observations")
-        commands = content.pop("commands")
-        by = "row" if terms.pop("use_gym_history", False) else "term"
-        source.refuse_unknown([*content, *terms], _FUNCTIONS)
-        rows = []
-        for name, item in terms.items():
-            params = dict(item["params"] or {})
-            selected = _select_joints((params.get("asset_cfg") or {}).get("joint_ids"), joints)
-            params["asset_cfg"] = {"joint_names": selected, "preserve_order": True}
-            item |= {"func": _FUNCTIONS[name], "params": params, "scale": collapse(item.get("scale"))}
-            row = read_term(name, item, {}, joints, source)
-            if row["term"] == "command":
-                row["limit"] = source.read_ranges(commands[params["command_name"]]["ranges"])
-            rows.append(row)
-        source.set_history(rows, [item.get("history_length") or 1 for item in terms.values()], by=by)
-        source.set(observation=rows)
-        return find_checkpoint(file.parent.parent, "exported/policy.onnx", f"{file.parent.name}/policy.onnx")
+    Returns the exported network.
+    """
+    source.file = file = path / "params" / "deploy.yaml" if path.is_dir() else path
+    content = read_yaml(file)
+    motors = [int(motor) for motor in content.pop("joint_ids_map")]
+    if len(motors) != len(source.joints):
+        must = f"must number {len(source.joints)}, the joints of {source.model_file}"
+        raise ValueError(f"{file}: joint_ids_map {must}, got {len(motors)}")
+    joints = _find_order(motors, source)
+    for name in ("stiffness", "damping"):
+        gains = content[name]
+        slots = sorted(motors) if len(gains) == len(motors) else range(len(gains))  # motors that are not there
+        content[name] = [gains[slots.index(motor)] for motor in motors]
+    names = ("stiffness", "damping", "default_joint_pos")
+    default = dict(zip(joints, content["default_joint_pos"], strict=True))
+    source.move(content, dict(zip(names, names, strict=True)), joints)
+    reason = f"{file.name} says the control step alone; the tasks of its makers have {_STEPS} physics steps in it"
+    source.set(physics_dt=round(content.pop("step_dt") / _STEPS, 6), decimation=_STEPS, reason=reason)
+    actions = content.pop("actions")
+    for name, action in actions.items():
+        moved = _select_joints(action.get("joint_ids"), joints)
+        is_usual = action.get("offset") == [default[joint] for joint in moved]
+        action |= {"class_type": name, "joint_names": moved, "preserve_order": True, "use_default_offset": is_usual}
+    reason = "the order in which the motors of a limb follow each other; joints are numbered, not named"
+    read_action(actions, joints, reason, source)
+    source.set(joints=source.settings.get("joints", joints), reason=reason)
+    terms = content.pop("observations")
+    commands = content.pop("commands")
+    by = "row" if terms.pop("use_gym_history", False) else "term"
+    source.refuse_unknown([*content, *terms], _FUNCTIONS)
+    rows = []
+    for name, item in terms.items():
+        params = dict(item["params"] or {})
+        selected = _select_joints((params.get("asset_cfg") or {}).get("joint_ids"), joints)
+        params["asset_cfg"] = {"joint_names": selected, "preserve_order": True}
+        item |= {"func": _FUNCTIONS[name], "params": params, "scale": collapse(item.get("scale"))}
+        row = read_term(name, item, {}, joints, source)
+        if row["term"] == "command":
+            row["limit"] = source.read_ranges(commands[params["command_name"]]["ranges"])
+        rows.append(row)
+    source.set_history(rows, [item.get("history_length") or 1 for item in terms.values()], by=by)
+    source.set(observation=rows)
+    return find_checkpoint(file.parent.parent, "exported/policy.onnx", f"{file.parent.name}/policy.onnx")
 
 
 def _find_order(motors: list[int], source: Source) -> list[str]:

@@ -25,60 +25,50 @@ _ROBOTS = {
 _GAIN_BY_ARMATURE = (20.0 * math.pi) ** 2  # of G1, whose joints swing at 10 Hz
 
 
-class Holosoma:
-    """Reads the metadata of an ONNX file, with the experiment_config of the training if they have it."""
+def read_holosoma(path: Path, source: Source) -> Path:
+    """Settings of the metadata, with the experiment_config of the training if they have it; returns the file."""
+    width = find_widths(load_network(path, "cpu", None, label="it"))[0]
+    content = {key: json.loads(text) for key, text in read_metadata(path).items()}
+    joints = content["dof_names"]
+    cfg = content.get("experiment_config")
+    source.find_model_file(content.get("robot_urdf_path"))
+    pose, terms = next((robot for joint, robot in _ROBOTS.items() if joint in joints), ({}, {}))
+    if cfg is None:
+        if not pose or width != 3 * len(joints) + 13:
+            got = f"{width} columns for {joints[0]}, ..."
+            raise ValueError(f"without experiment_config it must be the locomotion of G1 or T1, got {got}")
+        terms = terms | {name: {} for name in ("actions", "dof_pos", "projected_gravity", *_ORDERS)}
 
-    label = "a controller of holosoma (an ONNX file with its metadata)"
+    def look_up(name: str, usual: Any) -> Any:
+        """A value of the experiment_config, whose name has dots; the usual one if there is none."""
+        return usual if cfg is None else functools.reduce(dict.__getitem__, name.split("."), cfg)
 
-    def matches(self, path: Path) -> bool:
-        """Whether it is an ONNX file that names its joints and gains as holosoma does."""
-        return path.suffix == ".onnx" and path.is_file() and {"dof_names", "kp", "kd"} <= {*read_metadata(path)}
-
-    def read(self, path: Path, source: Source) -> Path:
-        """Settings of the metadata; the file is also that of the weights."""
-        width = find_widths(load_network(path, "cpu", None, label="it"))[0]
-        content = {key: json.loads(text) for key, text in read_metadata(path).items()}
-        joints = content["dof_names"]
-        cfg = content.get("experiment_config")
-        source.find_model_file(content.get("robot_urdf_path"))
-        pose, terms = next((robot for joint, robot in _ROBOTS.items() if joint in joints), ({}, {}))
-        if cfg is None:
-            if not pose or width != 3 * len(joints) + 13:
-                got = f"{width} columns for {joints[0]}, ..."
-                raise ValueError(f"without experiment_config it must be the locomotion of G1 or T1, got {got}")
-            terms = terms | {name: {} for name in ("actions", "dof_pos", "projected_gravity", *_ORDERS)}
-
-        def look_up(name: str, usual: Any) -> Any:
-            """A value of the experiment_config, whose name has dots; the usual one if there is none."""
-            return usual if cfg is None else functools.reduce(dict.__getitem__, name.split("."), cfg)
-
-        reason = "of holosoma_inference's own configuration, since the file has no experiment_config" * (cfg is None)
-        control = look_up("robot.control", {"action_scale": 0.25, "action_clip_value": 100.0})
-        if control.get("action_scales_by_effort_limit_over_p_gain"):
-            raise ValueError(f"{source.file}: action_scales_by_effort_limit_over_p_gain is not supported")
-        angles = per_joint(look_up("robot.init_state.default_joint_angles", pose), joints, "joint", partly=True)
-        values = {"default_joint_pos": [angle or 0.0 for angle in angles]}
-        values |= {"stiffness": content["kp"], "damping": content["kd"]}
-        if not source.model.dof_armature[6:].any():
-            usual = [round(gain / _GAIN_BY_ARMATURE, 9) for gain in content["kp"]] if pose is _G1_POSE else 0.03
-            values["armature"] = look_up("robot.dof_armature_list", usual)
-        source.move(values, {name: name for name in values}, joints)
-        source.reasons |= dict.fromkeys(("default_joint_pos", "armature"), reason)
-        sim = look_up("simulator.config.sim", {"fps": 200, "control_decimation": 4})
-        source.set(physics_dt=1.0 / sim["fps"], decimation=sim["control_decimation"], reason=reason)
-        source.set_joints(joints)
-        source.set(action_scale=control["action_scale"], action_clip=control["action_clip_value"], reason=reason)
-        period = look_up("command.setup_terms.locomotion_gait.params.gait_period", 1.0)
-        more = {"clock": {"period_s": period, "offset": [0.0, 0.5]}}  # of the left and the right foot
-        more["command"] = {"limit": source.read_ranges(content["command_ranges"])}
-        group = look_up("observation.groups.actor_obs", {"terms": terms})
-        source.refuse_unknown(group["terms"], _TERMS)
-        rows = []
-        for name, item in sorted(group["terms"].items()):  # as holosoma orders them
-            if item.get("clip") is not None:
-                raise ValueError(f"{source.file}: the clip of {name} is not supported")
-            term = _TERMS[name]
-            rows.append(make_term(term, item.get("scale"), order=_ORDERS.get(name), **more.get(term, {})))
-        source.set_history(rows, [group.get("history_length", 1)] * len(rows), fill="zeros")
-        source.set(observation=rows, reason=reason)
-        return path
+    reason = "of holosoma_inference's own configuration, since the file has no experiment_config" * (cfg is None)
+    control = look_up("robot.control", {"action_scale": 0.25, "action_clip_value": 100.0})
+    if control.get("action_scales_by_effort_limit_over_p_gain"):
+        raise ValueError(f"{source.file}: action_scales_by_effort_limit_over_p_gain is not supported")
+    angles = per_joint(look_up("robot.init_state.default_joint_angles", pose), joints, "joint", partly=True)
+    values = {"default_joint_pos": [angle or 0.0 for angle in angles]}
+    values |= {"stiffness": content["kp"], "damping": content["kd"]}
+    if not source.model.dof_armature[6:].any():
+        usual = [round(gain / _GAIN_BY_ARMATURE, 9) for gain in content["kp"]] if pose is _G1_POSE else 0.03
+        values["armature"] = look_up("robot.dof_armature_list", usual)
+    source.move(values, {name: name for name in values}, joints)
+    source.reasons |= dict.fromkeys(("default_joint_pos", "armature"), reason)
+    sim = look_up("simulator.config.sim", {"fps": 200, "control_decimation": 4})
+    source.set(physics_dt=1.0 / sim["fps"], decimation=sim["control_decimation"], reason=reason)
+    source.set(action_scale=control["action_scale"], action_clip=control["action_clip_value"], reason=reason)
+    period = look_up("command.setup_terms.locomotion_gait.params.gait_period", 1.0)
+    more = {"clock": {"period_s": period, "offset": [0.0, 0.5]}}  # of the left and the right foot
+    more["command"] = {"limit": source.read_ranges(content["command_ranges"])}
+    group = look_up("observation.groups.actor_obs", {"terms": terms})
+    source.refuse_unknown(group["terms"], _TERMS)
+    rows = []
+    for name, item in sorted(group["terms"].items()):  # as holosoma orders them
+        if item.get("clip") is not None:
+            raise ValueError(f"{source.file}: the clip of {name} is not supported")
+        term = _TERMS[name]
+        rows.append(make_term(term, item.get("scale"), order=_ORDERS.get(name), **more.get(term, {})))
+    source.set_history(rows, [group.get("history_length", 1)] * len(rows), fill="zeros")
+    source.set(observation=rows, reason=reason)
+    return path

@@ -29,46 +29,38 @@ _NET_SETTINGS = ("pos_scale", "vel_scale", "torque_scale", "input_order", "input
 _IDEAL_DRIVE = {"saturation_effort": 1e6, "velocity_limit": 1e6}  # stands beside joints with a DC motor
 
 
-class IsaacLab:
-    """Reads env.yaml and agent.yaml of a run."""
-
-    label = "a run of Isaac Lab (a folder with params/env.yaml)"
-
-    def matches(self, path: Path) -> bool:
-        """Whether it is a folder with params/env.yaml."""
-        return (path / "params" / "env.yaml").is_file()
-
-    def read(self, path: Path, source: Source) -> Path:
-        """Settings of env.yaml and agent.yaml; returns the exported network, else the last checkpoint."""
-        source.file = path / "params" / "env.yaml"
-        env = read_yaml(source.file)
-        agent_file = path / "params" / "agent.yaml"
-        agent = read_yaml(agent_file) if agent_file.is_file() else {}
-        articulation = env["scene"]["robot"]
-        source.find_model_file((articulation.get("spawn") or {}).get("asset_path"))
-        pose = articulation["init_state"]["joint_pos"]
-        pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
-        source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
-        _read_actuators(articulation["actuators"], source)
-        source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
-        for command in (env.get("commands") or {}).values():
-            source.set_speed((command.get("ranges") or {}) if isinstance(command, dict) else {})
-        joint_order = read_action(env, path, source, agent.get("clip_actions"))
-        observation_groups = agent.get("obs_groups") or {}
-        rows, lengths = [], []
-        for group_name in observation_groups.get("actor") or observation_groups.get("policy") or ["policy"]:
-            group = env["observations"][group_name]
-            terms = {name: term for name, term in group.items() if isinstance(term, dict)}
-            common = group.get("history_length")
-            lengths += [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
-            rows += [read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
-        source.set_history(rows, lengths)
-        reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
-        source.set(observation=rows, reason=reason)
-        weights = find_checkpoint(path, "exported/policy.pt", "exported/policy.onnx")
-        if weights.parent == path and (activation := read_activation(agent)) is not None:
-            source.set(activation=activation)
-        return weights
+def read_isaac_lab(path: Path, source: Source) -> Path:
+    """Settings of env.yaml and agent.yaml; returns the exported network, else the last checkpoint."""
+    source.file = path / "params" / "env.yaml"
+    env = read_yaml(source.file)
+    agent_file = path / "params" / "agent.yaml"
+    agent = read_yaml(agent_file) if agent_file.is_file() else {}
+    articulation = env["scene"]["robot"]
+    source.find_model_file((articulation.get("spawn") or {}).get("asset_path"))
+    pose = articulation["init_state"]["joint_pos"]
+    pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
+    source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
+    _read_actuators(articulation["actuators"], source)
+    source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
+    for command in (env.get("commands") or {}).values():
+        source.set_speed((command.get("ranges") or {}) if isinstance(command, dict) else {})
+    joint_order, reason = _order_joints(env, path, source)
+    read_action(env["actions"], joint_order, reason, source, limit=agent.get("clip_actions"))
+    observation_groups = agent.get("obs_groups") or {}
+    rows, lengths = [], []
+    for group_name in observation_groups.get("actor") or observation_groups.get("policy") or ["policy"]:
+        group = env["observations"][group_name]
+        terms = {name: term for name, term in group.items() if isinstance(term, dict)}
+        common = group.get("history_length")
+        lengths += [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
+        rows += [read_term(name, term, env["scene"], joint_order, source) for name, term in terms.items()]
+    source.set_history(rows, lengths)
+    reason = "lin_vel is that of the base's centre of mass" * any("at" in row for row in rows)
+    source.set(observation=rows, reason=reason)
+    weights = find_checkpoint(path, "exported/policy.pt", "exported/policy.onnx")
+    if weights.parent == path and (activation := read_activation(agent)) is not None:
+        source.set(activation=activation)
+    return weights
 
 
 def _read_actuators(groups: dict[str, Any], source: Source) -> None:
@@ -137,10 +129,10 @@ def _order_joints(env: dict[str, Any], path: Path, source: Source) -> tuple[list
     return joints, f"{kind} orders joints; IO_descriptors.yaml would say it"
 
 
-def read_action(env: dict[str, Any], path: Path, source: Source, limit: float | None) -> list[str]:
-    """Scale, offset, limits and joints of the action, which ``limit`` clips; returns the order of all joints."""
-    actions = env["actions"]
-    joint_order, reason = _order_joints(env, path, source)
+def read_action(
+    actions: dict[str, Any], joint_order: Sequence[str], reason: str, source: Source, *, limit: float | None = None
+) -> None:
+    """Scale, offset, limits and joints of the action, which ``limit`` clips; ``reason`` explains the joints' order."""
     kinds = {name: str(term["class_type"]).rpartition(":")[2] for name, term in actions.items() if term is not None}
     if list(kinds.values()) != ["JointPositionAction"]:
         raise ValueError(f"{source.file}: actions must be one JointPositionAction, got {kinds}")
@@ -165,7 +157,6 @@ def read_action(env: dict[str, Any], path: Path, source: Source, limit: float | 
         limits = (np.array(ranges) - np.c_[offset]) / np.c_[scale]
         limits = np.clip(limits, *(-1e9, 1e9) if limit is None else (-limit, limit)).tolist()
         source.set(action_clip=limits, reason="the range of targets as one of actions, which limits last_action, too")
-    return joint_order
 
 
 def read_term(
@@ -188,13 +179,21 @@ def read_term(
         row["period_s"] = params["period"]
     elif function == "height_scan":
         sensor = scene[params["sensor_cfg"]["name"]]
-        grid = sensor["pattern_cfg"]
-        turns = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
-        if "resolution" not in grid or not turns:
-            raise ValueError(f"{source.file}: a height scanner must be a grid in the yaw frame, got {grid}")
-        row["order"] = "x fastest" if grid.get("ordering", "xy") == "xy" else "y fastest"
+        row |= read_scan(sensor, sensor["pattern_cfg"], sensor["offset"]["pos"], source)
         row["offset"] = params.get("offset", 0.5)
-        step = grid["resolution"]
-        for axis, side, mid in zip("xy", grid["size"], sensor["offset"]["pos"], strict=False):
-            row[axis] = [round(mid - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
     return row
+
+
+def read_scan(sensor: dict[str, Any], grid: dict[str, Any], centre: Sequence[float], source: Source) -> dict[str, Any]:
+    """Order and points [m] of a height scan, whose ``grid`` is about ``centre`` in the base's yaw frame."""
+    turns = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
+    if "resolution" not in grid or not turns:
+        raise ValueError(f"{source.file}: a height scanner must be a grid in the yaw frame, got {grid}")
+    fields: dict[str, Any] = {
+        "order": "x fastest" if grid.get("ordering", "xy") == "xy" else "y fastest",
+        "offset": 0.0,
+    }
+    step = grid["resolution"]
+    for axis, side, mid in zip("xy", grid["size"], centre, strict=False):
+        fields[axis] = [round(mid - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
+    return fields

@@ -11,7 +11,7 @@ from onnx import numpy_helper
 from sim.controllers.formats.network import load_network
 from sim.controllers.formats.onnx_data import read_onnx
 from sim.controllers.formats.source import Source, collapse, find_weights, make_term
-from sim.files.settings import YAML_SUFFIXES, read_yaml, to_toml
+from sim.files.settings import read_yaml, to_toml
 
 _TERMS = {
     "state/body/rotation": "quat",
@@ -27,60 +27,51 @@ _TARGET = "target/joint/position"
 _GAINS = {"kp": "stiffness", "kd": "damping"}
 
 
-class Leapp:
-    """Reads the YAML of one model, whose outputs are targets of joints and their gains."""
-
-    label = "a policy of LEAPP (its YAML)"
-
-    def matches(self, path: Path) -> bool:
-        """Whether it is a YAML with models and the pipeline that they form."""
-        return path.suffix in YAML_SUFFIXES and path.is_file() and {"models", "pipeline"} <= read_yaml(path).keys()
-
-    def read(self, path: Path, source: Source) -> Path:
-        """Settings of the YAML, and what the network returns or holds; returns its file."""
-        content = read_yaml(path)
-        source.refuse_unknown(content, ("models", "pipeline", "system information", "semantic"))
-        if len(content["models"]) != 1:
-            raise ValueError(f"{path}: models must be one, got {', '.join(content['models'])}: export them as one node")
-        (model,) = content["models"].values()
-        pipeline, parameters = content["pipeline"], model["parameters"]
-        weights = find_weights(path.parent, parameters["model_path"])
-        if hashlib.sha256(weights.read_bytes()).hexdigest() != parameters["sha256sum"]:
-            raise ValueError(f"{weights} must have sha256sum {parameters['sha256sum']}: give the file of this YAML")
-        if "initial_values" in pipeline:
-            values = find_weights(path.parent, pipeline["initial_values"]).read_bytes()
-            if any(values[8 + int.from_bytes(values[:8], "little") :]):  # safetensors: length, header, numbers
-                raise ValueError(f"{path}: initial_values must be zeros, got others in {pipeline['initial_values']}")
-        load_network(weights, "cpu", None, label="it")  # refuses a damaged file
-        graph, data = read_onnx(weights)
-        inputs = {port["name"]: port for port in model["inputs"]}
-        ports = [inputs[port.name] for port in graph.graph.input if not inputs[port.name].get("is_state")]
-        source.set(observation=[_read_term(port, source) for port in ports])
-        outputs = {port.get("kind"): port for port in model["outputs"] if not port.get("is_state")}
-        source.refuse_unknown(map(str, outputs), (_TARGET, *_GAINS))
-        joints = outputs[_TARGET]["element_names"][-1]
-        source.set_joints(joints)
-        source.set(action_scale=1.0, action_offset=[0.0] * len(joints))
-        for column, (kind, name) in enumerate(_GAINS.items(), start=1):
-            values = _read_model_gains(source.model, column)
-            if kind in outputs:
-                values |= zip(joints, _read_constant(data, outputs[kind]["name"]), strict=True)
-            without = [joint for joint in source.joints if joint not in values]
-            gap = f"a value of each joint: {to_toml(values)}; none is said of {', '.join(without)}" * bool(without)
-            source.set(**{name: None if gap else collapse([*map(values.get, source.joints)])}, reason=gap)
-        constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.graph.initializer}
-        added = [constants.get(name) for node in graph.graph.node if node.op_type == "Add" for name in node.input]
-        offsets = [value for value in added if value is not None and value.size == len(joints)]
-        pose = dict(zip(source.joints, source.robot_file.home or [0.0] * len(source.joints), strict=True))
-        pose |= dict(zip(joints, offsets[-1].ravel().astype(float).round(6).tolist(), strict=True)) if offsets else {}
-        reason = "what the network adds to its actions, else the model's home, or 0"
-        source.set(default_joint_pos=collapse([*map(pose.get, source.joints)]), reason=reason)
-        scene = content.get("semantic", {}).get("scene", {})
-        rate = (pipeline.get("configs") or {}).get("frequency", 50.0)
-        reason = f"{rate:g} control steps a second" * ("physics_dt" not in scene)
-        steps = {"physics_dt": round(0.25 / rate, 6), "decimation": 4}
-        source.set(**{key: scene.get(key, value) for key, value in steps.items()}, reason=reason)
-        return weights
+def read_leapp(path: Path, source: Source) -> Path:
+    """Settings of the YAML of one model, and what the network returns, targets of joints and gains, or holds."""
+    content = read_yaml(path)
+    source.refuse_unknown(content, ("models", "pipeline", "system information", "semantic"))
+    if len(content["models"]) != 1:
+        raise ValueError(f"{path}: models must be one, got {', '.join(content['models'])}: export them as one node")
+    (model,) = content["models"].values()
+    pipeline, parameters = content["pipeline"], model["parameters"]
+    weights = find_weights(path.parent, parameters["model_path"])
+    if hashlib.sha256(weights.read_bytes()).hexdigest() != parameters["sha256sum"]:
+        raise ValueError(f"{weights} must have sha256sum {parameters['sha256sum']}: give the file of this YAML")
+    if "initial_values" in pipeline:
+        values = find_weights(path.parent, pipeline["initial_values"]).read_bytes()
+        if any(values[8 + int.from_bytes(values[:8], "little") :]):  # safetensors: length, header, numbers
+            raise ValueError(f"{path}: initial_values must be zeros, got others in {pipeline['initial_values']}")
+    load_network(weights, "cpu", None, label="it")  # refuses a damaged file
+    graph, data = read_onnx(weights)
+    inputs = {port["name"]: port for port in model["inputs"]}
+    ports = [inputs[port.name] for port in graph.graph.input if not inputs[port.name].get("is_state")]
+    source.set(observation=[_read_term(port, source) for port in ports])
+    outputs = {port.get("kind"): port for port in model["outputs"] if not port.get("is_state")}
+    source.refuse_unknown(map(str, outputs), (_TARGET, *_GAINS))
+    joints = outputs[_TARGET]["element_names"][-1]
+    source.set_joints(joints)
+    source.set(action_scale=1.0, action_offset=[0.0] * len(joints))
+    for column, (kind, name) in enumerate(_GAINS.items(), start=1):
+        values = _read_model_gains(source.model, column)
+        if kind in outputs:
+            values |= zip(joints, _read_constant(data, outputs[kind]["name"]), strict=True)
+        without = [joint for joint in source.joints if joint not in values]
+        gap = f"a value of each joint: {to_toml(values)}; none is said of {', '.join(without)}" * bool(without)
+        source.set(**{name: None if gap else collapse([*map(values.get, source.joints)])}, reason=gap)
+    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.graph.initializer}
+    added = [constants.get(name) for node in graph.graph.node if node.op_type == "Add" for name in node.input]
+    offsets = [value for value in added if value is not None and value.size == len(joints)]
+    pose = dict(zip(source.joints, source.robot_file.home or [0.0] * len(source.joints), strict=True))
+    pose |= dict(zip(joints, offsets[-1].ravel().astype(float).round(6).tolist(), strict=True)) if offsets else {}
+    reason = "what the network adds to its actions, else the model's home, or 0"
+    source.set(default_joint_pos=collapse([*map(pose.get, source.joints)]), reason=reason)
+    scene = content.get("semantic", {}).get("scene", {})
+    rate = (pipeline.get("configs") or {}).get("frequency", 50.0)
+    reason = f"{rate:g} control steps a second" * ("physics_dt" not in scene)
+    steps = {"physics_dt": round(0.25 / rate, 6), "decimation": 4}
+    source.set(**{key: scene.get(key, value) for key, value in steps.items()}, reason=reason)
+    return weights
 
 
 def _read_term(port: dict[str, Any], source: Source) -> dict[str, Any]:

@@ -3,67 +3,59 @@
 from pathlib import Path
 
 from sim.controllers.formats.rsl_rl import read_activation
-from sim.controllers.formats.source import BLIND_TERMS, CLOCK_PERIOD, Source, find_checkpoint, find_weights, make_term
-from sim.files.settings import YAML_SUFFIXES, read_yaml
+from sim.controllers.formats.source import (
+    BLIND_TERMS,
+    Source,
+    find_checkpoint,
+    find_weights,
+    make_terms,
+    match_parts,
+    read_scales,
+)
+from sim.files.settings import read_yaml
 
 _CONTROL = ("control_type", "use_actuator_network", "actuator_net_file", "stiffness", "damping")
 _HIM_TERMS = ("command", "ang_vel", "gravity", "joint_pos", "joint_vel", "last_action")
 
 
-class LeggedGym:
-    """Reads the configuration of an environment, classes as tables; the width of its observation says the terms."""
+def read_legged_gym(path: Path, source: Source) -> Path:
+    """Settings of an environment's configuration, classes as tables; the width of its observation says the terms.
 
-    label = "a training of legged_gym (its configuration as YAML or JSON)"
-
-    def matches(self, path: Path) -> bool:
-        """Whether it is a YAML or JSON with the scales of legged_gym's observation."""
-        is_text = path.suffix in (*YAML_SUFFIXES, ".json") and path.is_file()
-        return is_text and "obs_scales" in (read_yaml(path).get("normalization") or ())
-
-    def read(self, path: Path, source: Source) -> Path:
-        """Settings of the configuration; returns the exported network beside it, else the last checkpoint."""
-        cfg = read_yaml(path)
-        control, normalization, terrain = cfg["control"], cfg["normalization"], cfg.get("terrain") or {}
-        source.find_model_file(cfg["asset"]["file"])
-        source.refuse_unknown(control, (*_CONTROL, "action_scale", "decimation"))
-        if control.get("control_type", "P") != "P":
-            raise ValueError(f"control_type must be P, joint positions, got {control['control_type']}")
-        has_net = control.get("use_actuator_network")
-        if has_net:
-            source.set(actuator_net={"file": str(find_weights(path.parent, control["actuator_net_file"]).resolve())})
-        for name in () if has_net else ("stiffness", "damping"):
-            gains = {joint: [gain for key, gain in control[name].items() if key in joint] for joint in source.joints}
-            if without := [joint for joint, matches in gains.items() if not matches]:
-                raise ValueError(f"{name} must have a part of every joint's name, got none of {', '.join(without)}")
-            source.set("", **{name: [matches[-1] for matches in gains.values()]})  # of several the last counts there
-        angles = cfg["init_state"]["default_joint_angles"]
-        source.set(default_joint_pos=[angles[joint] for joint in source.joints])
-        source.set(physics_dt=cfg["sim"]["dt"], decimation=control["decimation"], action_scale=control["action_scale"])
-        source.set(action_clip=normalization["clip_actions"], observation_clip=normalization["clip_observations"])
-        source.set_speed((cfg.get("commands") or {}).get("ranges") or {})
-        joints = [names[-1] for names in sorted(source.joint_paths())]
-        source.set_joints(joints, "a leg after the other, legs by name, as Isaac Gym orders joints")
-        width, row = cfg["env"]["num_observations"], cfg["env"].get("num_one_step_observations")
-        scales, blind = normalization["obs_scales"], 9 + 3 * len(joints)
-        factors = {"joint_pos": scales["dof_pos"], "joint_vel": scales["dof_vel"], "ang_vel": scales["ang_vel"]}
-        factors |= {"lin_vel": scales["lin_vel"], "command": [scales["lin_vel"]] * 2 + [scales["ang_vel"]]}
-        grid = {axis: terrain.get(f"measured_points_{axis}") or [] for axis in "xy"}
-        factors["scan"] = scales.get("height_measurements")
-        fields = {
-            "scan": {**grid, "order": "y fastest", "offset": 0.5, "clip": 1.0},
-            "clock": {"period_s": CLOCK_PERIOD},
-        }
-        with_velocity = ("lin_vel", *BLIND_TERMS)
-        layouts = {0: BLIND_TERMS, 2: (*BLIND_TERMS, "clock")}
-        layouts |= {3 + len(grid["x"]) * len(grid["y"]): (*with_velocity, "scan"), 3: with_velocity}
-        names = _HIM_TERMS if row == blind else layouts.get(width - blind, ())
-        if row == blind:
-            source.set(history={"length": width // row, "newest": "first", "by": "row", "fill": "zeros"})
-        terms = [make_term(name, factors.get(name), **fields.get(name, {})) for name in names]
-        usual = f"as legged_gym, unitree_rl_gym or HIMLoco order {width} columns"
-        gap = f"its {width} columns in its order, with scale; no usual observation is so wide"
-        source.set(observation=terms or None, reason=usual if terms else gap)
-        weights = find_checkpoint(path.parent, "policy*.pt")
-        if weights.name.startswith("model_"):
-            source.set(activation=read_activation(cfg) or "elu", reason="elu is usual in legged_gym")
-        return weights
+    Returns the exported network beside it, else the last checkpoint.
+    """
+    cfg = read_yaml(path)
+    control, normalization, terrain = cfg["control"], cfg["normalization"], cfg.get("terrain") or {}
+    source.find_model_file(cfg["asset"]["file"])
+    source.refuse_unknown(control, (*_CONTROL, "action_scale", "decimation"))
+    if control.get("control_type", "P") != "P":
+        raise ValueError(f"control_type must be P, joint positions, got {control['control_type']}")
+    if control.get("use_actuator_network"):
+        source.set(actuator_net={"file": str(find_weights(path.parent, control["actuator_net_file"]).resolve())})
+    else:
+        stiffness, damping = (match_parts(control[name], source.joints, name) for name in ("stiffness", "damping"))
+        source.set(stiffness=stiffness, damping=damping)
+    angles = cfg["init_state"]["default_joint_angles"]
+    source.set(default_joint_pos=[angles[joint] for joint in source.joints])
+    source.set(physics_dt=cfg["sim"]["dt"], decimation=control["decimation"], action_scale=control["action_scale"])
+    source.set(action_clip=normalization["clip_actions"], observation_clip=normalization["clip_observations"])
+    source.set_speed((cfg.get("commands") or {}).get("ranges") or {})
+    joints = [names[-1] for names in sorted(source.joint_paths())]
+    source.set_joints(joints, "a leg after the other, legs by name, as Isaac Gym orders joints")
+    width, row = cfg["env"]["num_observations"], cfg["env"].get("num_one_step_observations")
+    scales, blind = normalization["obs_scales"], 9 + 3 * len(joints)
+    grid = {axis: terrain.get(f"measured_points_{axis}") or [] for axis in "xy"}
+    with_velocity = ("lin_vel", *BLIND_TERMS)
+    layouts = {0: BLIND_TERMS, 2: (*BLIND_TERMS, "clock")}
+    layouts |= {3 + len(grid["x"]) * len(grid["y"]): (*with_velocity, "scan"), 3: with_velocity}
+    names = _HIM_TERMS if row == blind else layouts.get(width - blind, ())
+    if row == blind:
+        source.set(history={"length": width // row, "newest": "first", "by": "row", "fill": "zeros"})
+    factors = read_scales(scales) | {"scan": scales.get("height_measurements")}
+    terms = make_terms(names, factors, scan={**grid, "order": "y fastest", "offset": 0.5, "clip": 1.0})
+    usual = f"as legged_gym, unitree_rl_gym or HIMLoco order {width} columns"
+    gap = f"its {width} columns in its order, with scale; no usual observation is so wide"
+    source.set(observation=terms or None, reason=usual if terms else gap)
+    weights = find_checkpoint(path.parent, "policy*.pt")
+    if weights.name.startswith("model_"):
+        source.set(activation=read_activation(cfg) or "elu", reason="elu is usual in legged_gym")
+    return weights

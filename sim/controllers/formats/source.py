@@ -80,7 +80,7 @@ class Source:
             raise ValueError(f"{what}: take it out if it does not matter")
 
     def move(self, content: dict[str, Any], names: Mapping[str, str], joints: Sequence[str]) -> None:
-        """Moves values from ``content`` to settings of other names; lists of the source's joints are reordered."""
+        """Moves values from ``content`` to settings of other names; lists in the order of ``joints`` are reordered."""
         for key, name in names.items():
             value = content.pop(key)
             if name in PER_JOINT and isinstance(value, list):
@@ -89,6 +89,7 @@ class Source:
                     raise ValueError(f"{self.file}: {key} must be {must}, got {len(value)} of {', '.join(joints)}")
                 value = [value[list(joints).index(joint)] for joint in self.joints]
             self.set(**{name: collapse(value)})
+        self.set_joints(joints)
 
     def set_joints(self, joints: Sequence[str], reason: str = "") -> None:
         """Stores the controller's order of joints, if it is not that of the model."""
@@ -146,6 +147,27 @@ def make_term(name: str, scale: Any = None, **fields: Any) -> dict[str, Any]:
     if scale is not None and not np.all(np.equal(scale, 1.0)):
         fields = {"scale": scale, **fields}
     return {"term": name, **{key: value for key, value in fields.items() if value is not None}}
+
+
+def make_terms(names: Iterable[str], scales: Mapping[str, Any], **fields: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Terms of the observation with their scales and fields; a clock has the usual period."""
+    fields = {"clock": {"period_s": CLOCK_PERIOD}} | fields
+    return [make_term(name, scales.get(name), **fields.get(name, {})) for name in names]
+
+
+def read_scales(scales: Mapping[str, Any]) -> dict[str, Any]:
+    """Scales of terms by legged_gym's names, in which a command has those of velocities."""
+    names = {"lin_vel": "lin_vel", "ang_vel": "ang_vel", "joint_pos": "dof_pos", "joint_vel": "dof_vel"}
+    command = [scales["lin_vel"], scales["lin_vel"], scales["ang_vel"]]
+    return {"command": command} | {term: scales[name] for term, name in names.items()}
+
+
+def match_parts(table: Mapping[str, Any], joints: Sequence[str], name: str) -> list[Any]:
+    """A value of each joint: that of the last key which is a part of its name, else that of ``default``."""
+    values = {joint: [table[key] for key in table if key in joint][-1:] or [table.get("default")] for joint in joints}
+    if without := [joint for joint, value in values.items() if value == [None]]:
+        raise ValueError(f"{name} must have a part of every joint's name, got none of {', '.join(without)}")
+    return [value for (value,) in values.values()]
 
 
 def find_checkpoint(folder: Path, *exported: str) -> Path:
