@@ -193,14 +193,14 @@ class Simulation:
         columns = solver.mj_q_start.numpy()[1 : 1 + robot.num_joints]  # the first is the base's
         moved = solver.mj_model.jnt_qposadr[solver.mj_model.actuator_trnid[:, 0]]
         joints = [int(np.flatnonzero(columns == column)[0]) for column in moved]
-        num_pose, num_feet, num_torques = robot.sense_sizes
+        *_, num_position, num_quat, num_feet, num_torques = robot.column_sizes
         scan_x, scan_y = robot.scan_points()
         numbers = {"default_joint_pos": robot.default_joint_pos, "scan_x": scan_x, "scan_y": scan_y}
         feet = len(robot.geom_names) - num_feet + np.arange(num_feet)
         indices = {"foot_columns": feet, "torque_columns": columns[:num_torques] - 1}
         arrays = {name: wp.array(row, dtype=float) for name, row in numbers.items()}
         arrays |= {name: wp.array(row, dtype=int) for name, row in indices.items()}
-        self.sensors = make_struct(Sensors, num_pose=num_pose, **arrays)
+        self.sensors = make_struct(Sensors, num_pose=num_position + num_quat, **arrays)
         bodies = np.argsort(solver.mjc_body_to_newton.numpy()[0])  # what is no body of the robot is -1, and comes first
         self._coordinates = make_struct(
             SolverState,

@@ -203,9 +203,7 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
     """Splits a robot's observation rows, shape (num_envs, observation_size), into physical quantities."""
     if row.ndim != 2 or row.shape[1] != robot.observation_size:
         raise ValueError(f"row must have shape (num_envs, {robot.observation_size}), got {tuple(row.shape)}")
-    pose, feet, torques = robot.sense_sizes
-    senses = min(pose, 3), max(pose - 3, 0), feet, torques
-    columns = row.split([3, 3, 3, 2, 1, *[robot.num_joints] * 3, robot.num_scan_points, *senses], dim=1)
+    columns = row.split(robot.column_sizes, dim=1)
     lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan, *_ = columns
     return Sensed(
         lin_vel=lin_vel / LIN_VEL_SCALE,

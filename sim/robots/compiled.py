@@ -446,11 +446,10 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
         problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")
     gains = drives.stiffness if robot.stiffness is None else robot.stiffness
-    if (
-        robot.actuator_net is None
-        and not problems
-        and (limp := [k for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers)])
-    ):
-        listed = ", ".join(names[k] for k in limp)
-        problems.append(f"no gains for {listed}: give stiffness and damping, or <position> in {robot.model_file}")
+    motorless = {names[k] for k in drives.followers}
+    limp = [name for name, gain in zip(names, gains, strict=False) if not gain > 0.0 and name not in motorless]
+    if limp and not problems and robot.actuator_net is None:
+        problems.append(
+            f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {robot.model_file}"
+        )
     return [*problems, *no_geom]

@@ -150,17 +150,16 @@ class RobotCfg:
         return len(self.scan_x) * len(self.scan_y)
 
     @property
-    def sense_sizes(self) -> tuple[int, ...]:
-        """Columns of the base's pose, of the contacts of the feet and of torques, in the observation row's order."""
-        sizes = {"pose": 7, "contacts": len(self.foot_geoms), "torques": self.num_joints}
-        return tuple(size * (name in self.senses) for name, size in sizes.items())
+    def column_sizes(self) -> tuple[int, ...]:
+        """Columns of the observation row: of velocities, gravity, command (2, 1), joints, scan, senses (pose: 3, 4)."""
+        joints, pose = self.num_joints, "pose" in self.senses
+        feet, torques = len(self.foot_geoms) * ("contacts" in self.senses), joints * ("torques" in self.senses)
+        return (3, 3, 3, 2, 1, joints, joints, joints, self.num_scan_points, 3 * pose, 4 * pose, feet, torques)
 
     @property
     def observation_size(self) -> int:
         """Columns of the observation row."""
-        from kernels.observation import NUM_BASE_COLUMNS  # with Warp, which the help of commands does not need
-
-        return NUM_BASE_COLUMNS + 3 * self.num_joints + self.num_scan_points + sum(self.sense_sizes)
+        return sum(self.column_sizes)
 
     @property
     def control_dt(self) -> float:

@@ -330,12 +330,10 @@ def _disturb_noise(step: DisturbedStep, row: wp.array[float], first: int, env: i
 
 def noise_widths(robot: Any) -> NDArray[np.float64]:
     """Half widths of legged_gym's noise of each column of an observation, shape (observation_size,)."""
-    noise, joints = NoiseCfg(), robot.num_joints
-    pose, feet, torques = robot.sense_sizes
-    counts = [3, 3, 3, 3, joints, joints, joints, robot.num_scan_points, min(pose, 3), max(pose - 3, 0), feet + torques]
-    widths = [2.0 * noise.lin_vel, 0.25 * noise.ang_vel, noise.gravity, 0.0]
-    widths += [noise.joint_pos, 0.05 * noise.joint_vel, 0.0, 5.0 * noise.scan, 0.0, 0.5 * noise.gravity, 0.0]
-    return np.repeat(widths, counts)
+    noise = NoiseCfg()
+    widths = [2.0 * noise.lin_vel, 0.25 * noise.ang_vel, noise.gravity, 0.0, 0.0]
+    widths += [noise.joint_pos, 0.05 * noise.joint_vel, 0.0, 5.0 * noise.scan, 0.0, 0.5 * noise.gravity, 0.0, 0.0]
+    return np.repeat(widths, robot.column_sizes)
 
 
 class ObservationNoise(Condition):
