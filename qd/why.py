@@ -48,25 +48,22 @@ class Change(NamedTuple):
 def write_out(cfg: ControllerCfg, robot: RobotCfg) -> ControllerCfg:
     """The description with what it leaves out: joints, pose, and a number for each column and joint."""
     joints = cfg.joints or robot.joint_names
-    widths = Described(cfg, robot, "controller.toml").widths
-    terms = [
-        replace(term, scale=_times(term.scale, np.ones(width)))
-        for term, width in zip(cfg.observation, widths, strict=True)
-    ]
-    default = cfg.default or _select(robot.default_joint_pos, robot, joints)
+    for k, width in enumerate(Described(cfg, robot, "controller.toml").widths):
+        cfg = _scale_term(cfg, k, np.ones(width))
     scale = _times(cfg.action_scale, np.ones(len(joints)))
-    return replace(cfg, joints=joints, default=default, action_scale=scale, observation=tuple(terms))
+    return replace(
+        cfg, joints=joints, default=cfg.default or _select(robot.default_joint_pos, robot, joints), action_scale=scale
+    )
 
 
 def propose_changes(base: Variant) -> list[Change]:
     """Changes of one thing each, without those that change nothing; the description of ``base`` is written out."""
-    cfg, changes = base.controller, dict[str, Change]()
-    descriptions = (*_change_terms(cfg), *_change_actions(cfg, base.robot))
-    variants = [(text, replace(base, controller=changed)) for text, changed in descriptions]
+    descriptions = (*_change_terms(base.controller), *_change_actions(base.controller, base.robot))
+    variants = [(text, replace(base, controller=cfg)) for text, cfg in descriptions]
+    changes: dict[str, Change] = {repr(base): Change("nothing", base)}
     for text, variant in (*variants, *_change_drives(base)):
-        if variant != base:
-            changes.setdefault(repr(variant), Change(text, variant))
-    return [*changes.values()]
+        changes.setdefault(repr(variant), Change(text, variant))
+    return [*changes.values()][1:]
 
 
 def _times(values: Any, factors: Any) -> tuple[float, ...]:
@@ -131,10 +128,9 @@ def _change_actions(cfg: ControllerCfg, robot: RobotCfg) -> Iterator[tuple[str, 
         if count <= _ALL_PAIRS or kinds[i] == kinds[j] or limbs[i] == limbs[j]:
             names = [*joints[:i], joints[j], *joints[i + 1 : j], joints[i], *joints[j + 1 :]]
             yield f"order of {joints[i]} and {joints[j]}", replace(cfg, joints=tuple(names))
-    by_kind = sorted(range(count), key=lambda j: kinds.index(kinds[j]))
-    by_limb = sorted(range(count), key=lambda j: limbs.index(limbs[j]))
-    for order in (by_kind, by_limb, sorted(range(count), key=joints.__getitem__)):
-        yield "order of joints", replace(cfg, joints=tuple(joints[j] for j in order))
+    by_kind, by_limb = ([groups.index(group) for group in groups] for groups in (kinds, limbs))
+    for keys in (by_kind, by_limb, joints):
+        yield "order of joints", replace(cfg, joints=tuple(joints[j] for j in np.argsort(keys, kind="stable")))
     different = [*dict.fromkeys(filter(None, limbs))]
     for permuted in itertools.permutations(different) if len(different) <= 4 else ():
         others = dict(zip(different, permuted, strict=True))
@@ -144,11 +140,12 @@ def _change_actions(cfg: ControllerCfg, robot: RobotCfg) -> Iterator[tuple[str, 
 
 
 def _change_drives(base: Variant) -> Iterator[tuple[str, Variant]]:
-    """Gains, limits and delay of drives, and time steps."""
+    """Gains and delay of drives, and time steps."""
     robot = base.robot
+    gains = _read_gains(robot)
     for changed, factor in itertools.product((*_GAINS, "stiffness and damping"), (0.5, 2.0)):
         names = changed.split(" and ")
-        if all(_read_gains(robot)[name].any() for name in names):
+        if all(gains[name].any() for name in names):
             factors = [factor if name in names else 1.0 for name in _GAINS]
             yield f"{changed} x {factor}", replace(base, gains=_times(base.gains, factors))
     for steps in (0, max(robot.decimation // 2, 1), robot.decimation, 2 * robot.decimation):
@@ -159,11 +156,10 @@ def _change_drives(base: Variant) -> Iterator[tuple[str, Variant]]:
 
 
 def _read_gains(robot: RobotCfg) -> dict[str, NDArray[np.float64]]:
-    """Of each joint, by the names of :data:`_GAINS`; those of an actuator network are none."""
+    """Of each joint, by the names of :data:`_GAINS`; an actuator network has none but armature."""
     model = robot_spec(robot).compile()
     drives = read_drives(model)
-    gains = np.array([drives.stiffness, drives.damping]) * (robot.actuator_net is None)
-    return dict(zip(_GAINS, (*gains, model.dof_armature[6:]), strict=True))
+    return dict(zip(_GAINS, (drives.stiffness, drives.damping, model.dof_armature[6:]), strict=True))
 
 
 def rank_changes(base: Variant, weights: Path, *, device: str) -> list[Change]:

@@ -67,13 +67,12 @@ def walk_variants(
     """
     prepare_torch(device)
     result = np.zeros((len(variants), replicas, len(MEASURES)))
-    streams = [int(wp.rand_init(seed, k)) for k in range(replicas)]
+    streams = np.array([int(wp.rand_init(seed, k)) for k in range(replicas)], np.uint32)
     times = [(variant.robot.physics_dt, variant.robot.decimation) for variant in variants]
     for time in dict.fromkeys(times):
         rows = [k for k, other in enumerate(times) if other == time]
         trial = _Trial([variants[k] for k in rows], weights, device, replicas, seconds)
-        trial.begin(np.tile(np.array(streams, np.uint32), len(rows)))
-        result[rows] = trial.walk(seconds).reshape(len(rows), replicas, -1)
+        result[rows] = trial.walk(np.tile(streams, len(rows)), seconds).reshape(len(rows), replicas, -1)
     return result
 
 
@@ -106,32 +105,32 @@ class _Trial(Rollout):
             scales = np.stack(columns, axis=1).reshape(-1, *[1] * (row.ndim - 2), len(columns))
             setattr(model, name, wp.array((row * scales).astype(np.float32), dtype=array.dtype, device=array.device))
 
-    def begin(self, streams: NDArray[np.uint32]) -> None:
-        """Let each robot begin an episode by its random stream."""
+    @torch.inference_mode()
+    def walk(self, streams: NDArray[np.uint32], seconds: float) -> NDArray[np.float64]:
+        """The measures of each robot's episode, which begins by its random stream, (num_envs, num_measures)."""
+        robot = self.robot
+        sim = self.sim
         self._episode.rng.assign(streams)
         self._queue.begins.fill_(1)
-        self.sim.restart(self._queue.begins, self._robot_step, self._ranges, self._episode, self._rewards)
-        reset_all(self.side_by_side, self.num_envs, self.sim.device)
-        self.sim.launch(self._turn_graph)  # which writes what they observe
-
-    @torch.inference_mode()
-    def walk(self, seconds: float) -> NDArray[np.float64]:
-        """The measures of each robot's episode, (num_envs, num_measures)."""
-        robot, sim, policy = self.robot, self.sim, self.side_by_side
+        sim.restart(self._queue.begins, self._robot_step, self._ranges, self._episode, self._rewards)
+        reset_all(self.side_by_side, self.num_envs, sim.device)
+        sim.launch(self._turn_graph)  # which writes what they observe
         arrays = (self._observation, self.outcome, sim.joint_qd, sim.joint_torque)
         rows, outcome, joint_qd, joint_torque = map(wp.to_torch, arrays)
         weight = -float(sim.model.gravity.numpy()[0][2]) * float(sim.model.body_mass.numpy().sum()) / self.num_envs
         records: list[torch.Tensor] = []  # a step, shape (num_measures, num_envs)
         for _ in range(round(seconds / robot.control_dt)):
-            before = policy.output.clone()
+            before = self.side_by_side.output.clone()
             self.control_step()
+            output = self.side_by_side.output
+            size = output.shape[1] ** 0.5
             sensed = read_row(rows, robot)
             values = (
                 sensed.lin_vel[:, :2] - sensed.command[:, :2],
                 sensed.ang_vel[:, :2],
                 sensed.gravity[:, :2],
-                (policy.output - before) * 0.02 / robot.control_dt / policy.output.shape[1] ** 0.5,
-                policy.output / policy.output.shape[1] ** 0.5,
+                (output - before) * 0.02 / robot.control_dt / size,
+                output / size,
                 (joint_torque[:, 6 : 6 + robot.num_joints] * sensed.joint_vel).sum(1, keepdim=True) / weight,
             )
             runs = (outcome == int(Outcome.RUNNING)).float()

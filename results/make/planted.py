@@ -61,9 +61,7 @@ def plant_errors(
     errors = [(kind, change, other) for (kind, change), other in zip(drawn, speeds, strict=True)]
     for kind in ERRORS:
         replaced = [] if kind in dict(drawn) else ["it has none"]
-        for error in [error for error in errors if error[0] == kind] + [
-            error for error in errors if error[0] in SPARES
-        ]:
+        for error in [error for drawn_kind in (kind, *SPARES) for error in errors if error[0] == drawn_kind]:
             if abs(error[2] - walked) >= LEAST_CHANGE * walked:
                 errors.remove(error)
                 yield *error, replaced
@@ -85,8 +83,9 @@ def measure(file: Path, device: str, seed: int) -> dict[str, Any]:
         rank = next((k for k, change in enumerate(ranked, 1) if change.variant == base), None)
         named = ranked[0].variant == base and lines[0].startswith("It walks best")
         row = {"kind": kind, "planted": error.text, "replaced": replaced, "speed": speed, "named": named, "rank": rank}
-        rows.append(row | {"first_line": lines[0], "wall_s": time.perf_counter() - started})
-        print(json.dumps(rows[-1]), flush=True)
+        row |= {"first_line": lines[0], "wall_s": time.perf_counter() - started}
+        print(json.dumps(row), flush=True)
+        rows.append(row)
     return {**controller_identity(robot, str(path)), "named": sum(row["named"] for row in rows), "errors": rows}
 
 
