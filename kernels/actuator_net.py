@@ -48,20 +48,20 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
         ``weights`` lie layer by layer, and in it by four rows: their biases, then those of each input. Four rows are
         the gates i, f, g and o of a unit of an LSTM, whose inputs end with the hidden state, or one of each quarter of
         a dense layer. ``sizes`` are the layers' units, (num_layers,), and ``inputs`` columns of the memory. A drive's
-        memory, 0 when an episode begins, is the number of steps, the torque, error [rad] and velocity [rad/s] of each
-        evaluation, the newest first, and hidden and cell state of each LSTM.
+        memory, 0 when an episode begins, is error [rad] and velocity [rad/s] of each evaluation, the newest first, the
+        number of steps, the torque, and hidden and cell state of each LSTM.
         """
         env, k = wp.tid()
         memory = memory_out[env, k]
-        steps = int(memory[0])
-        memory[0] = float(steps + 1)
+        state = 2 * history + 2
+        steps = int(memory[state - 2])
+        memory[state - 2] = float(steps + 1)
         if steps % decimation == 0:
-            state = 2 + 2 * history
-            for j in range(2 * history - 2):
-                memory[state - 1 - j] = memory[state - 3 - j]
+            for j in range(2 * history - 1, 1, -1):
+                memory[j] = memory[j - 2]
             column = solver_out.target_of_actuator[k]
-            memory[2] = solver_out.ctrl[env, k] - joint_q[env, column]
-            memory[3] = joint_qd[env, column - 1]
+            memory[0] = solver_out.ctrl[env, k] - joint_q[env, column]
+            memory[1] = joint_qd[env, column - 1]
             x = vector()
             count = inputs.shape[0]
             for j in range(count):
@@ -93,7 +93,7 @@ def make_torques(width: int, *, num_recurrent: int, activation: int, history: in
                 state += 2 * size
                 x = y
                 count = size
-            memory[1] = x[0]
-        solver_out.ctrl[env, k] = memory[1]
+            memory[2 * history + 1] = x[0]
+        solver_out.ctrl[env, k] = memory[2 * history + 1]
 
     return write_torques

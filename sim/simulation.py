@@ -76,10 +76,8 @@ class Simulation:
         None, and the mass added to each base [kg].
         """
         if terrain_of_env.min() < 0 or terrain_of_env.max() >= bank.num_terrains:
-            raise ValueError(
-                f"terrain_of_env must lie in 0..{bank.num_terrains - 1}, "
-                f"got {terrain_of_env.min()}..{terrain_of_env.max()}"
-            )
+            got = f"{terrain_of_env.min()}..{terrain_of_env.max()}"
+            raise ValueError(f"terrain_of_env must lie in 0..{bank.num_terrains - 1}, got {got}")
         if bank.device != "cpu":
             gc.collect()  # simulations that were closed lie in cycles, and hold their memory until they are collected
         self.robot = robot
@@ -237,7 +235,7 @@ class Simulation:
         return (
             wp.array(np.concatenate([four.transpose(1, 2, 0).reshape(-1, 4) for four in rows]), dtype=wp.vec4),
             wp.array(net.sizes, dtype=int),
-            wp.array(2 + np.array(net.inputs), dtype=int),
+            wp.array(net.inputs, dtype=int),
             wp.zeros((*self.solver.mjw_data.ctrl.shape, num_columns), dtype=float),
         )
 

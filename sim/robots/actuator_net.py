@@ -18,9 +18,8 @@ Array = NDArray[np.float64]
 class ActuatorNet:
     """A network of ``count`` drives from the beginning of an episode on, in NumPy.
 
-    ``layers`` are matrices, with the bias first, of rows gate by gate of an LSTM; ``sizes``, ``num_recurrent``,
-    ``activation`` and ``history`` are those of :func:`kernels.actuator_net.make_torques`; ``inputs`` begin two columns
-    later there.
+    ``layers`` are matrices, the bias first, with rows gate by gate of an LSTM; ``sizes``, ``inputs``,
+    ``num_recurrent``, ``activation`` and ``history`` are those of :func:`kernels.actuator_net.make_torques`.
     """
 
     def __init__(self, cfg: ActuatorNetCfg, count: int = 0) -> None:
@@ -28,7 +27,7 @@ class ActuatorNet:
         self._cfg = cfg
         try:
             module = torch.jit.load(str(cfg.file), map_location="cpu").eval()
-            self._read_layers({name: value.double().numpy() for name, value in module.state_dict().items()})
+            self._read_layers({name: value.double().numpy() for name, value in module.state_dict().items()}, cfg)
             if not any(self._answers_like(module, index) for index in range(len(ACTIVATIONS))):
                 raise ValueError("its layers do not answer as it does")
         except Exception as error:  # a foreign file can fail with anything
@@ -36,7 +35,7 @@ class ActuatorNet:
             raise ValueError(f"actuator_net.file must be {must}, got {cfg.file}: {in_one_line(error)}") from error
         self._begin(count)
 
-    def _read_layers(self, weights: dict[str, Array]) -> None:
+    def _read_layers(self, weights: dict[str, Array], cfg: ActuatorNetCfg) -> None:
         lstms = [name for name in weights if "weight_ih" in name]
         names = [*lstms, *(name for name in weights if name.endswith(".weight"))]
         columns = [[weights[name.replace("weight", "bias")], weights[name]] for name in names]
@@ -46,7 +45,7 @@ class ActuatorNet:
         self.num_recurrent = len(lstms)
         self.layers = [*map(np.column_stack, columns)]
         self.sizes = [len(weights[name]) // (4 if name in lstms else 1) for name in names]
-        cfg, count = self._cfg, columns[0][1].shape[1]
+        count = columns[0][1].shape[1]
         ago = cfg.input_idx or tuple(range(count // 2))
         if 2 * len(ago) != count:
             raise ValueError(f"it has {count} inputs, expected input_idx of {count // 2} numbers, got {ago}")
