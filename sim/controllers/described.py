@@ -204,7 +204,7 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
     if row.ndim != 2 or row.shape[1] != robot.observation_size:
         raise ValueError(f"row must have shape (num_envs, {robot.observation_size}), got {tuple(row.shape)}")
     columns = row.split(robot.column_sizes, dim=1)
-    lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan, *_ = columns
+    lin_vel, ang_vel, gravity, speed, yaw_rate, joint_pos, joint_vel, last_action, scan, *senses = columns
     return Sensed(
         lin_vel=lin_vel / LIN_VEL_SCALE,
         ang_vel=ang_vel / ANG_VEL_SCALE,
@@ -214,10 +214,10 @@ def read_row(row: torch.Tensor, robot: RobotCfg) -> Sensed:
         joint_vel=joint_vel / JOINT_VEL_SCALE,
         last_action=last_action,
         scan=(scan / SCAN_SCALE + SCAN_OFFSET).reshape(len(row), len(robot.scan_x), len(robot.scan_y)),
-        base_pos=columns[-4],
-        quat=columns[-3],
-        contacts=columns[-2] / FORCE_SCALE,
-        torques=columns[-1] / FORCE_SCALE,
+        base_pos=senses[0],
+        quat=senses[1],
+        contacts=senses[2] / FORCE_SCALE,
+        torques=senses[3] / FORCE_SCALE,
     )
 
 
@@ -290,6 +290,8 @@ class Described(torch.nn.Module):
         """Set the network, which has :attr:`observation_size` columns and one action a joint."""
         cfg = self.cfg
         self.network = network
+        self.graph_safe = is_graph_safe(network)
+        """Whether it may be captured as a CUDA graph, its ``reset`` too."""
         self._device = device
         self._memories: dict[int, _Memory] = {}  # by the number of robots: a graph keeps their addresses
 
@@ -348,9 +350,9 @@ class Described(torch.nn.Module):
         if term.term in ("rpy", "heading", "quat", "command"):
             return [_COLUMNS[name] for name in (term.axes or term.order or _USUAL_ORDERS.get(term.term, "yaw")).split()]
         if term.term != "scan":
-            sizes = {"last_action": self.num_actions, "contacts": len(self.robot.foot_geoms)}
-            sizes |= {"constant": np.size(term.value)}
-            sizes |= {"clock": np.size(term.offset or 0.0) * len((term.order or "").split())}
+            waves = len((term.order or "").split())
+            sizes = {"last_action": self.num_actions, "contacts": len(robot.foot_geoms)}
+            sizes |= {"constant": np.size(term.value), "clock": waves * np.size(term.offset or 0.0)}
             return range(sizes.get(term.term, 3))
         x, y = (np.round(values, 4).tolist() for values in (term.x or robot.scan_x, term.y or robot.scan_y))
         points = [(a, b) for b in y for a in x] if term.order == "x fastest" else [(a, b) for a in x for b in y]
@@ -361,11 +363,6 @@ class Described(torch.nn.Module):
             remedy = f"write into robot.toml scan_x = {[*dict.fromkeys(x)]} and scan_y = {[*dict.fromkeys(y)]}"
             self._refuse(f"the scan's points are not those of the robot: {remedy}")
         return [robot_points.index(point) for point in points]
-
-    @property
-    def graph_safe(self) -> bool:
-        """Whether it may be captured as a CUDA graph, its ``reset`` too."""
-        return is_graph_safe(self.network)
 
     def _get_memory(self, count: int) -> _Memory:
         if count not in self._memories:

@@ -53,7 +53,8 @@ def read_leapp(path: Path, source: Source) -> Path:
     source.set_joints(joints)
     source.set(action_scale=1.0, action_offset=[0.0] * len(joints))
     for column, (kind, name) in enumerate(_GAINS.items(), start=1):
-        values = _read_model_gains(source.model, column)
+        drives = zip(source.model.actuator_trnid[:, 0], source.model.actuator_biasprm, strict=True)
+        values = {source.model.joint(joint).name: -float(bias[column]) for joint, bias in drives if bias[1]}
         if kind in outputs:
             values |= zip(joints, _read_constant(data, outputs[kind]["name"]), strict=True)
         without = [joint for joint in source.joints if joint not in values]
@@ -97,9 +98,3 @@ def _read_constant(data: bytes, name: str) -> list[float]:
         got = "values that follow its inputs: they are not simulated"
         raise ValueError(f"its output {name} must be constant, got {got}")
     return first.ravel().astype(float).round(6).tolist()
-
-
-def _read_model_gains(model: Any, column: int) -> dict[str, float]:
-    """Gains of the model's position actuators by joint, from a column of their biases."""
-    driven = [k for k in range(model.nu) if model.actuator_biasprm[k, 1] != 0.0]
-    return {model.joint(model.actuator_trnid[k, 0]).name: -float(model.actuator_biasprm[k, column]) for k in driven}
