@@ -250,7 +250,6 @@ class Described(torch.nn.Module):
         self.cfg = cfg
         self.robot = robot
         self._path = path
-        self.network: Any = None
         if missing := {*needed_senses(term.axes or term.term for term in cfg.observation)} - {*robot.senses}:
             remedy = f"write into robot.toml senses = {to_toml(sorted({*robot.senses, *missing}))}"
             self._refuse(f"observation needs the robot's {', '.join(sorted(missing))}: {remedy}")

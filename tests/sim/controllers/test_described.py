@@ -258,8 +258,7 @@ def test_joints_that_a_network_never_moves_are_named(tmp_path, anymal, describe)
 
 
 def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, remembering):
-    weights = tmp_path / "weights.pt"
-    assert ControllerSpec.parse(remembering).files == (remembering, weights)
+    assert ControllerSpec.parse(remembering).files == (remembering, tmp_path / "weights.pt")
     assert not ControllerSpec.parse(remembering).runs_code  # a run goes on without its name
     digest = controller_hash(remembering)
     pytest.importorskip("ray")
@@ -268,10 +267,6 @@ def test_it_is_its_file_and_its_weights_wherever_they_lie(tmp_path, anymal, reme
     elsewhere = PackedCode.of(str(remembering)).unpacked(tmp_path / "elsewhere")
     now, moved = (load_policy(path, anymal, "cpu")(rows_of(4)) for path in (remembering, elsewhere))
     assert controller_hash(elsewhere) == digest and torch.equal(now, moved)
-    remembering.write_text(remembering.read_text().replace("0.5}", "0.4}"))
-    assert controller_hash(remembering) not in (None, digest)
-    weights.unlink()
-    assert controller_hash(remembering) is None
 
 
 @pytest.mark.parametrize(
