@@ -389,23 +389,21 @@ def league() -> str:
         """A cell: the size of an obstacle that half of the robots cross."""
         return lambda row: next((format_size(h, row["dose"]) for h in row["half"] if h["element"] == name), NONE)
 
-    def goals(terrains: str) -> Callable[[Any], str]:
-        """A cell: goal rates at the common heights."""
-        rates = ("0.05", "0.1", "0.2")
-        return lambda row: " / ".join(
-            shown(terrains, "goal_rate", form=".2f")(row.get("rates", {}).get(h, {})) for h in rates
-        )
+    def at_heights(*keys: str, form: str = "") -> Callable[[Any], str]:
+        """A cell: a number at each of the common heights."""
+        heights = ("0.05", "0.1", "0.2")
+        return lambda row: " / ".join(shown(*keys, form=form)(row.get("rates", {}).get(h, {})) for h in heights)
 
     ends = ("", "_mujoco_c", "_publisher")
     columns: dict[str, Column] = {
         "level ground [m/s]": lambda row: " / ".join(shown("check", f"flat_speed{e}", form=".3f")(row) for e in ends),
-        "hand-crafted": goals("hand_crafted"),
-        "hard-random": goals("hard_random"),
+        "hand-crafted": at_heights("hand_crafted", "goal_rate", form=".2f"),
+        "hard-random": at_heights("hard_random", "goal_rate", form=".2f"),
         "kerb": half("step_up"),
         "stairs": half("stairs_up"),
         "payload": half("payload"),
         "delay": half("delay"),
-        "failing families": "failing_families",
+        "failing families": at_heights("search", "failing_families"),
         "commonest cause": list_causes(1),
         "licence": lambda row: row.get("licence", NONE),
     }

@@ -16,6 +16,7 @@ from qd.check import ensure_ready
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
 from qd.evaluate.level import measure_level_ground
+from qd.faults.families import Ranking
 from qd.faults.judge import judge
 from qd.faults.minimise import minimise
 from qd.search.directory import RunDirectory
@@ -44,9 +45,9 @@ from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
 
 CONTROLLERS = LEAGUE["controllers"]
 ITERATIONS = 3
-"""Of preset wide."""
+"""Of preset wide, at the height that fits; one at each of the common heights."""
 HEIGHTS = (0.05, 0.1, 0.2)
-"""Of terrains that all controllers cross [m]."""
+"""Of terrains that all controllers cross, and that are searched against all [m]."""
 _RISES = "0.02,0.04,0.06,0.08,0.1,0.15,0.2,0.3"
 OBSTACLES = (f"step_up={_RISES}", f"stairs_up={_RISES}", "payload", "delay")
 """Of which the size is measured that half of the robots cross."""
@@ -94,8 +95,28 @@ def ready(name: str, folder: Path, runs: Path, compute: Compute) -> RobotCfg:
     return ensure_ready(get_robot(str(home / "robot.toml")), None, compute)
 
 
+def search_at(
+    robot: RobotCfg,
+    space: str,
+    run: Path,
+    compute: Compute,
+    *,
+    seed: int,
+    small: bool,
+    iterations: int = 1,
+    stages: tuple[str, ...] = ("fresh",),
+) -> tuple[Ranking, dict[str, Any]]:
+    """A search of terrains of a space, judged: its elites ranked, and its counts."""
+    cfg = preset("small" if small else "wide", robot, None, space=space)
+    search(replace(cfg, seed=seed, iterations=iterations), run, compute, robot=robot)
+    judge(run, stages=stages, compute=compute, robot=robot.spec)
+    ranking, summary = open_run(robot.spec, run).rank(judged=True), RunDirectory(run).read_summary()
+    families = len({*ranking.families[ranking.failing].tolist()})
+    return ranking, {count: summary.get(count) for count in (*COUNTS, "wall_s")} | {"failing_families": families}
+
+
 def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
-    """Level ground, rates at common heights, sizes of obstacles, and a search with one minimal failure."""
+    """Level ground, rates and a search at common heights, sizes of obstacles, and a search with a minimal failure."""
     chosen, run = CONTROLLERS[name], runs / f"{name}-archive"
     robot, publisher = ready(name, folder, runs, compute), PUBLISHERS[name](folder)
     policy = str(robot.policy_file)
@@ -106,16 +127,16 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     for height in HEIGHTS[: 1 if small else None]:
         out, at = runs / f"{name}-rates-{height:g}.json", at_height(SUPER_GAUSSIAN, height).name
         report = evaluate_rates(robot, policy, compute=compute, space=at, seed=seed, out=out, **sizes)
-        rates[f"{height:g}"] = {key: report[key] for key in ("hand_crafted", "hard_random")}
+        searched = search_at(robot, at, runs / f"{name}-archive-{height:g}", compute, seed=seed, small=small)
+        rates[f"{height:g}"] = {key: report[key] for key in ("hand_crafted", "hard_random")} | {"search": searched[1]}
     doses, out = parse_doses(OBSTACLES[:1] if small else OBSTACLES, ()), runs / f"{name}-dose.json"
     terrains = 1 if small else None
     dose = measure_dose(robot, {name: policy}, doses, compute=compute, terrains=terrains, seed=seed, out=out)
     space = fitting_space(robot) or SUPER_GAUSSIAN.name
-    cfg = preset("small" if small else "wide", robot, None, space=space)
-    search(replace(cfg, seed=seed, iterations=1 if small else ITERATIONS), run, compute, robot=robot)
-    judge(run, stages=("fresh",) if small else ("fresh", "resolved"), compute=compute, robot=robot.spec)
-    opened, summary = open_run(robot.spec, run), RunDirectory(run).read_summary()
-    ranking = opened.rank(judged=True)
+    iterations, stages = (1, ("fresh",)) if small else (ITERATIONS, ("fresh", "resolved"))
+    ranking, counts = search_at(
+        robot, space, run, compute, seed=seed, small=small, iterations=iterations, stages=stages
+    )
     families = dict(zip(ranking.families[ranking.failing], ranking.numbers[ranking.failing], strict=True))
     worst = None if not families else int(families[min(families)])
     if worst is not None:
@@ -144,8 +165,8 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         "rates": rates,
         "dose": dose["dose"],
         "half": dose["half"],
-        "archive": {count: summary.get(count) for count in (*COUNTS, "wall_s")},
-        "failing_families": len(families),
+        "archive": counts,
+        "failing_families": counts["failing_families"],
         "faults_witness": None,
         "causes": {cause: len(rows) for cause, rows in ranking.by_cause().items()},
         "minimal": worst,
