@@ -6,6 +6,7 @@ the ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
 
 import itertools
 import re
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -244,6 +245,9 @@ def read_robot_file(model_file: Path, *, visuals: bool = False) -> RobotFile:
             setattr(usual.option, name, getattr(spec.option, name))
         spec.option = usual.option
         spec.fuse_static()
+        for geom in touching_geoms(spec.worldbody):
+            warnings.warn(f"{model_file}: geom {geom.name} belongs to the world and is left out", stacklevel=2)
+            spec.delete(geom)
         model = spec.compile()
     except Exception as error:  # MuJoCo's own type has no name
         reason = _quote_urdf(" ".join(str(error).split()), files)
@@ -401,8 +405,6 @@ def _structure_problems(model: Any) -> Iterator[str]:
     for k in range(1, model.njnt):
         if model.jnt_type[k] == mj.mjtJoint.mjJNT_FREE or model.body_jntnum[model.jnt_bodyid[k]] != 1:
             yield f"joint {model.joint(k).name} must be a hinge or slide, the only joint of its body"
-    for k in np.flatnonzero((model.geom_bodyid == 0) & (model.geom_contype != 0)):
-        yield f"geom {model.geom(k).name} belongs to the world, not to the robot: take it out"
     poses = np.hstack([model.body_pos, model.body_quat, model.body_ipos])
     for k in range(1, model.nbody):
         if not np.isfinite(poses[k]).all():
@@ -446,10 +448,8 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
         problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")
     gains = drives.stiffness if robot.stiffness is None else robot.stiffness
-    motorless = {names[k] for k in drives.followers}
-    limp = [name for name, gain in zip(names, gains, strict=False) if not gain > 0.0 and name not in motorless]
+    limp = [k for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers)]
     if limp and not problems and robot.actuator_net is None:
-        problems.append(
-            f"no gains for {', '.join(limp)}: give stiffness and damping, or <position> in {robot.model_file}"
-        )
+        listed = ", ".join(names[k] for k in limp)
+        problems.append(f"no gains for {listed}: give stiffness and damping, or <position> in {robot.model_file}")
     return [*problems, *no_geom]

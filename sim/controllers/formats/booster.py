@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sim.controllers.formats.source import Source, find_weights, make_terms, match_parts, read_scales
+from sim.controllers.formats.source import Source, make_terms, read_scales
 from sim.files.settings import read_yaml
 
 _GAINS = ("stiffness", "damping")
@@ -20,7 +20,7 @@ def read_booster(path: Path, source: Source) -> Path:
     else:
         tables = {name: cfg["control"][name] for name in _GAINS}
         tables["default_joint_pos"] = cfg["init_state"]["default_joint_angles"]
-        values = {name: match_parts(table, joints, name) for name, table in tables.items()}
+        values = {name: source.match_parts(table, name) for name, table in tables.items()}
         cfg |= cfg["env"] | cfg["sim"]
         cfg["gait_frequency"] = sum(cfg["commands"]["gait_frequency"]) / 2.0
         cfg["policy_path"] = f"deploy/models/{path.stem}.pt"
@@ -37,4 +37,4 @@ def read_booster(path: Path, source: Source) -> Path:
     terms = make_terms(_TERMS, read_scales(scales) | {"gravity": scales["gravity"]}, clock=clock)
     reason = "the order of its code, whose low pass of commands and targets is left out"
     source.set(observation=terms, reason=reason)
-    return find_weights(path.parent, cfg["policy_path"])
+    return source.find_weights(cfg["policy_path"])

@@ -10,7 +10,7 @@ from onnx import numpy_helper
 
 from sim.controllers.formats.network import load_network
 from sim.controllers.formats.onnx_data import read_onnx
-from sim.controllers.formats.source import Source, collapse, find_weights, make_term
+from sim.controllers.formats.source import Source, collapse, make_term
 from sim.files.settings import read_yaml, to_toml
 
 _TERMS = {
@@ -35,11 +35,11 @@ def read_leapp(path: Path, source: Source) -> Path:
         raise ValueError(f"{path}: models must be one, got {', '.join(content['models'])}: export them as one node")
     (model,) = content["models"].values()
     pipeline, parameters = content["pipeline"], model["parameters"]
-    weights = find_weights(path.parent, parameters["model_path"])
+    weights = source.find_weights(parameters["model_path"])
     if hashlib.sha256(weights.read_bytes()).hexdigest() != parameters["sha256sum"]:
         raise ValueError(f"{weights} must have sha256sum {parameters['sha256sum']}: give the file of this YAML")
     if "initial_values" in pipeline:
-        values = find_weights(path.parent, pipeline["initial_values"]).read_bytes()
+        values = source.find_weights(pipeline["initial_values"]).read_bytes()
         if any(values[8 + int.from_bytes(values[:8], "little") :]):  # safetensors: length, header, numbers
             raise ValueError(f"{path}: initial_values must be zeros, got others in {pipeline['initial_values']}")
     load_network(weights, "cpu", None, label="it")  # refuses a damaged file

@@ -3,15 +3,7 @@
 from pathlib import Path
 
 from sim.controllers.formats.rsl_rl import read_activation
-from sim.controllers.formats.source import (
-    BLIND_TERMS,
-    Source,
-    find_checkpoint,
-    find_weights,
-    make_terms,
-    match_parts,
-    read_scales,
-)
+from sim.controllers.formats.source import BLIND_TERMS, Source, find_checkpoint, make_terms, read_scales
 from sim.files.settings import read_yaml
 
 _CONTROL = ("control_type", "use_actuator_network", "actuator_net_file", "stiffness", "damping")
@@ -30,9 +22,9 @@ def read_legged_gym(path: Path, source: Source) -> Path:
     if control.get("control_type", "P") != "P":
         raise ValueError(f"control_type must be P, joint positions, got {control['control_type']}")
     if control.get("use_actuator_network"):
-        source.set(actuator_net={"file": str(find_weights(path.parent, control["actuator_net_file"]).resolve())})
+        source.set(actuator_net={"file": str(source.find_weights(control["actuator_net_file"]).resolve())})
     else:
-        stiffness, damping = (match_parts(control[name], source.joints, name) for name in ("stiffness", "damping"))
+        stiffness, damping = (source.match_parts(control[name], name) for name in ("stiffness", "damping"))
         source.set(stiffness=stiffness, damping=damping)
     angles = cfg["init_state"]["default_joint_angles"]
     source.set(default_joint_pos=[angles[joint] for joint in source.joints])

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sim.controllers.formats.source import SETTINGS, TERM_NAMES, Source, find_weights, make_terms
+from sim.controllers.formats.source import SETTINGS, TERM_NAMES, Source, make_terms
 from sim.files.settings import read_yaml
 
 _TERMS = TERM_NAMES | {"g1_phase": "clock"}
@@ -45,6 +45,6 @@ def read_rl_sar(path: Path, source: Source) -> Path:
     source.refuse_unknown(names, _TERMS)
     scales = {_TERMS[name]: content.pop(f"{name}_scale") for name in _SCALED if f"{name}_scale" in content}
     source.set(observation=make_terms([_TERMS[name] for name in names], scales))
-    weights = find_weights(file.parent, content.pop("model_name"))
+    weights = source.find_weights(content.pop("model_name"))
     source.refuse_unknown(content, _WITHOUT_EFFECT)
     return weights

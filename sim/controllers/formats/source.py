@@ -68,6 +68,14 @@ class Source:
             model_file = find_above(str(name), self.file.parent)
             self.model_file = model_file and find_robot_of_scene(model_file)
 
+    def find_weights(self, name: str) -> Path:
+        """The file of weights that the source names; its name may have a path of another machine."""
+        folder = self.file.parent
+        file = find_above(name, folder) or folder / Path(name).name
+        if not file.is_file():
+            raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
+        return file
+
     def set(self, reason: str = "", **settings: Any) -> None:
         """Stores settings, with the reason if they are guesses."""
         self.settings |= settings
@@ -90,6 +98,13 @@ class Source:
                 value = [value[list(joints).index(joint)] for joint in self.joints]
             self.set(**{name: collapse(value)})
         self.set_joints(joints)
+
+    def match_parts(self, table: Mapping[str, Any], name: str) -> list[Any]:
+        """A value of each joint: that of the last key which is a part of its name, else that of ``default``."""
+        values = [([table.get("default")] + [table[key] for key in table if key in joint])[-1] for joint in self.joints]
+        if without := [joint for joint, value in zip(self.joints, values, strict=True) if value is None]:
+            raise ValueError(f"{name} must have a part of every joint's name, got none of {', '.join(without)}")
+        return values
 
     def set_joints(self, joints: Sequence[str], reason: str = "") -> None:
         """Stores the controller's order of joints, if it is not that of the model."""
@@ -162,14 +177,6 @@ def read_scales(scales: Mapping[str, Any]) -> dict[str, Any]:
     return {"command": command} | {term: scales[name] for term, name in names.items()}
 
 
-def match_parts(table: Mapping[str, Any], joints: Sequence[str], name: str) -> list[Any]:
-    """A value of each joint: that of the last key which is a part of its name, else that of ``default``."""
-    values = {joint: [table[key] for key in table if key in joint][-1:] or [table.get("default")] for joint in joints}
-    if without := [joint for joint, value in values.items() if value == [None]]:
-        raise ValueError(f"{name} must have a part of every joint's name, got none of {', '.join(without)}")
-    return [value for (value,) in values.values()]
-
-
 def find_checkpoint(folder: Path, *exported: str) -> Path:
     """The network that a run exported, whose patterns are tried in turn, else its last checkpoint."""
     files = next(filter(None, (sorted(folder.glob(pattern)) for pattern in exported)), [])
@@ -179,11 +186,3 @@ def find_checkpoint(folder: Path, *exported: str) -> Path:
     if not files + checkpoints:
         raise ValueError(f"it has no weights, expected {', '.join(exported)} or model_*.pt in {folder}")
     return [*checkpoints, *files][-1]
-
-
-def find_weights(folder: Path, name: str) -> Path:
-    """The file of weights that a source in ``folder`` names; its name may have a path of another machine."""
-    file = find_above(name, folder) or folder / Path(name).name
-    if not file.is_file():
-        raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
-    return file

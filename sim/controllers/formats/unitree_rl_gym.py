@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sim.controllers.formats.source import BLIND_TERMS, SETTINGS, TERM_NAMES, Source, find_weights, make_terms
+from sim.controllers.formats.source import BLIND_TERMS, SETTINGS, TERM_NAMES, Source, make_terms
 from sim.files.settings import read_yaml
 
 _UNITREE_KEYS = ("default_angles", "kps", "kds", "action_scale", "simulation_dt", "control_decimation")
@@ -26,6 +26,6 @@ def read_unitree_rl_gym(path: Path, source: Source) -> Path:
     has_clock = width > blind
     reason = "the order of unitree_rl_gym's deploy_mujoco.py" + ", and the period of its clock" * has_clock
     source.set(observation=make_terms([*BLIND_TERMS, *["clock"] * has_clock], scales), reason=reason)
-    weights = find_weights(path.parent, content.pop("policy_path"))
+    weights = source.find_weights(content.pop("policy_path"))
     source.refuse_unknown(content, ("simulation_duration", "cmd_init"))
     return weights

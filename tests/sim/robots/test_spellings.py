@@ -63,6 +63,7 @@ SPELLINGS = {
     "drives backwards": drives("{0}").replace("".join(JOINTS), "".join(BACKWARDS)),
     "degrees": swap(('angle="radian"', 'angle="degree"'), ('range="-1.5 2.5"', 'range="-86 143"'),
                     ('range="-2.6 -0.1"', 'range="-149 -5.7"')),
+    "a floor": swap(("<worldbody>", '<worldbody><geom name="floor" type="plane" size="1 1 1"/>')),
     "another solver": swap(("<default>\n", '<option cone="pyramidal" integrator="RK4" timestep="0.01" tolerance="1"/>'
                                            "<default>\n")),
     "sensors, keys and flags": swap(("</mujoco>", '<sensor><gyro site="imu"/></sensor><keyframe><key/></keyframe>'
@@ -98,7 +99,7 @@ def start_flight(robot, device, offset):
     return sim
 
 
-@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'", "ignore:.*floor belongs to the world")
 @pytest.mark.parametrize("text", SPELLINGS.values(), ids=SPELLINGS)
 def test_a_file_flies_as_in_mujoco(tmp_path, device, text):
     robot = get_robot(str(write_dog(tmp_path, model=text)))
