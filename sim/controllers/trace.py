@@ -76,11 +76,12 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
         quantities.append((log.get(name, torch.zeros(len(observation), width)) - zeros) * torch.tensor(scale))
     row = torch.cat(quantities, dim=1)
     rows = torch.nn.functional.pad(row, (0, robot.observation_size - row.shape[1])).split(1)
-    rebuilt, answers = [], []
+    rebuilt: list[torch.Tensor] = []
+    answers: list[torch.Tensor] = []
     reset_all(controller, 1)
     for step, row in enumerate(rows):
         rebuilt.append(controller.observe(row))
-        answers.append(controller.network(observation[step : step + 1]))
+        answers.append(controller.network(observation[step : step + 1]).clone())
         controller.act(log["action"][step : step + 1] if "action" in log else answers[-1])
     labels = _label_columns(controller)
     names = [label.partition(" ")[0] for label in labels]
@@ -103,8 +104,6 @@ def _compare(name: str, ours: torch.Tensor, theirs: torch.Tensor, labels: Sequen
     our, their = float(ours[step, column]), float(theirs[step, column])
     ratio = ours[differs[:, column], column] / theirs[differs[:, column], column]
     same = (ratio - ratio[0]).abs().max() < _TOLERANCE * ratio[0].abs()
-    line = (
-        f"{name} {column} ({labels[column]}) at step {step}: {their:.4g} in the log, {our:.4g} by the contract, off by"
-    )
-    line += f" {our - their:.4g}; {int(differs.any(0).sum())} columns differ"
+    values = f"{their:.4g} in the log, {our:.4g} by the contract, off by {our - their:.4g}"
+    line = f"{name} {column} ({labels[column]}) at step {step}: {values}; {int(differs.any(0).sum())} columns differ"
     return [line + f"; it is {ratio[0]:.4g} times the log's at every step" * bool(same)]
