@@ -15,7 +15,6 @@ import warp as wp
 
 from kernels.episode import Episodes
 from kernels.launch import kernel_over
-from kernels.observation import Noise, Sensors
 
 Effects = tuple[tuple[Any, int], ...]
 """Warp functions of conditions, each with the column of its first number."""
@@ -57,8 +56,8 @@ class Disturbed:
 
     row: wp.array2d[float]
     """Conditions of each robot, shape (num_envs, number of values)."""
-    noise: Noise
-    """Half widths of legged_gym's noise."""
+    noise: wp.array[float]
+    """Half widths of legged_gym's noise, shape (observation_size,)."""
     former: wp.array3d[float]
     """Observations of the last control steps, shape (num_envs, 1 + max_lag_steps, observation_size)."""
     age: wp.array2d[int]
@@ -71,7 +70,6 @@ class DisturbedStep:
 
     memory: Disturbed
     episodes: Episodes
-    sensors: Sensors
     dt: float
     """Length of the steps that the episodes count [s]."""
     every: int

@@ -42,18 +42,6 @@ class Sensors:
     """Columns in ``joint_torque`` of the joints whose torque is observed, shape (num_joints,) or (0,)."""
 
 
-@wp.struct
-class Noise:
-    """Half widths of uniform observation noise, in the units of the measured quantity; all zero for none."""
-
-    lin_vel: float
-    ang_vel: float
-    gravity: float
-    joint_pos: float
-    joint_vel: float
-    scan: float
-
-
 @wp.func
 def _base_column(step: RobotStep, env: int, k: int) -> float:
     if k < 3:
@@ -86,43 +74,20 @@ def _sense_column(step: RobotStep, sensors: Sensors, env: int, k: int) -> float:
     return step.joint_torque[env, sensors.torque_columns[foot - num_feet]] * FORCE_SCALE
 
 
-@wp.func
-def noise_width(noise: Noise, sensors: Sensors, k: int) -> float:
-    """Half width of the noise of column ``k`` of an observation: a small turn by a is half of a in a quaternion."""
-    num_joints = sensors.default_joint_pos.shape[0]
-    if k < 3:
-        return noise.lin_vel * LIN_VEL_SCALE
-    if k < 6:
-        return noise.ang_vel * ANG_VEL_SCALE
-    if k < 9:
-        return noise.gravity
-    if k < NUM_BASE_COLUMNS:
-        return 0.0
-    if k < NUM_BASE_COLUMNS + num_joints:
-        return noise.joint_pos
-    if k < NUM_BASE_COLUMNS + 2 * num_joints:
-        return noise.joint_vel * JOINT_VEL_SCALE
-    if k < NUM_BASE_COLUMNS + 3 * num_joints:
-        return 0.0
-    sense = k - NUM_BASE_COLUMNS - 3 * num_joints - sensors.scan_x.shape[0]
-    if sense < 0:
-        return noise.scan * SCAN_SCALE
-    return wp.where(sense >= 3 and sense < sensors.num_pose, 0.5 * noise.gravity, 0.0)
-
-
 @kernel_over("observation_out")
 def write_observation(
     step: RobotStep,
     terrain_of_env: wp.array[int],
     terrain: Terrain,
     sensors: Sensors,
-    noise: Noise,
+    noise: wp.array[float],
     noise_seed: wp.array[int],
     observation_out: wp.array2d[float],
 ):
     """Grid (num_envs, observation_size): write one row an environment (columns: module docstring).
 
-    The command is in the base's yaw frame; ``noise_seed`` is one integer that the caller advances, shape (1,).
+    The command is in the base's yaw frame; ``noise`` are half widths of uniform noise, (observation_size,), or None;
+    ``noise_seed`` is one integer that the caller advances, shape (1,).
     """
     env, k = wp.tid()
     num_joints = step.action.shape[1]
@@ -140,10 +105,9 @@ def write_observation(
         column = _scan_column(step.joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
     else:
         column = _sense_column(step, sensors, env, joint - 3 * num_joints - sensors.scan_x.shape[0])
-    width = noise_width(noise, sensors, k)
-    if width > 0.0:
+    if k < noise.shape[0]:
         state = wp.rand_init(noise_seed[0], env * observation_out.shape[1] + k)
-        column += width * wp.randf(state, -1.0, 1.0)
+        column += noise[k] * wp.randf(state, -1.0, 1.0)
     observation_out[env, k] = wp.clamp(column, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
-from kernels.observation import Noise, apply_action
+from kernels.observation import apply_action
 from kernels.penalties import PENALTIES, add_penalties, penalty_columns
 from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.rewards import Rewards, remember_steps
@@ -254,7 +254,7 @@ class Rollout:
             begin_episodes(queue.begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
         command_goal(sim.joint_q, episode.outcome, self._task, self.command)
-        sim.observe(self._robot_step, episode, self.robot.physics_dt, Noise(), self._counter, self._observation)
+        sim.observe(self._robot_step, episode, self.robot.physics_dt, None, self._counter, self._observation)
 
     @property
     def num_free(self) -> int:

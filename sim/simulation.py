@@ -17,7 +17,7 @@ from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, 
 from kernels.episode import Episodes, Outcome
 from kernels.ground import Ground
 from kernels.launch import make_struct, make_zeros
-from kernels.observation import Noise, Sensors, write_observation
+from kernels.observation import Sensors, write_observation
 from kernels.penalties import BASE, FOOT, LIMB
 from kernels.queue import StartRanges, clear_rows, restart_episodes
 from kernels.rewards import Motion, Rewards, make_rewards, make_weights, reward_steps
@@ -257,12 +257,16 @@ class Simulation:
         rows = (self.num_envs, self.bank.conditions.shape[1])
         former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)
         self.disturbed = make_zeros(Disturbed, self.device, row=rows, age=observed, former=former)
-        self.disturbed.noise = make_struct(Noise, NoiseCfg())
+        self.disturbed.noise = self.make_noise(NoiseCfg())
 
     def set_drive_delays(self, steps: np.ndarray) -> None:
         """Let targets of each robot be late by so many physics steps, at most the robot's ``drive_delay_steps``."""
         if self._delay.steps is not None:
             self._delay.steps.assign(steps)
+
+    def make_noise(self, cfg: NoiseCfg) -> Any:
+        """Half widths of the noise of each column of an observation, shape (observation_size,)."""
+        return wp.array(cfg.column_widths(self.robot.column_sizes), dtype=float, device=self.device)
 
     def make_step(self, command: Any, action: Any) -> RobotStep:
         """A view of the robots at the end of a step that obeys the command (num_envs, 3) by the clipped action."""
@@ -279,7 +283,7 @@ class Simulation:
         self.begin_conditions(mask)
 
     def observe(
-        self, step: RobotStep, episodes: Episodes, dt: float, noise: Noise, noise_seed: Any, observation: Any
+        self, step: RobotStep, episodes: Episodes, dt: float, noise: Any, noise_seed: Any, observation: Any
     ) -> None:
         """Write what robots observe before their next control step, (num_envs, observation_size).
 

@@ -1,9 +1,12 @@
 """Settings of a robot for the training of its controllers: rewards, learning, fine-tuning."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from sim.files.settings import Interval, NonNegativeFloat, PositiveFloat, PositiveInt, Share
 
@@ -18,6 +21,15 @@ class NoiseCfg:
     joint_pos: NonNegativeFloat = 0.01
     joint_vel: NonNegativeFloat = 1.5
     scan: NonNegativeFloat = 0.1
+
+    def column_widths(self, sizes: Sequence[int]) -> NDArray[np.float64]:
+        """Half width of each column of an observation whose quantities have the sizes of ``robot.column_sizes``.
+
+        A small turn by a is half of a in a quaternion.
+        """
+        widths = [2.0 * self.lin_vel, 0.25 * self.ang_vel, self.gravity, 0.0, 0.0]
+        widths += [self.joint_pos, 0.05 * self.joint_vel, 0.0, 5.0 * self.scan, 0.0, 0.5 * self.gravity, 0.0, 0.0]
+        return np.repeat(widths, sizes)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import torch
 import warp as wp
 
 from kernels.episode import command_goal
-from kernels.observation import ANG_VEL_SCALE, LIN_VEL_SCALE, Noise, write_observation
+from kernels.observation import ANG_VEL_SCALE, LIN_VEL_SCALE, write_observation
 from kernels.penalties import BASE, FOOT, LIMB, PENALTIES, add_penalties, penalty_columns
 from kernels.super_gaussian import LOWER, NEGLIGIBLE, UPPER, rasterise
 from sim.crossing import CrossingCfg, make_task
@@ -214,7 +214,7 @@ def _observation_case(scene: Scene) -> Case:
     flops = sim.num_envs * (22 * points + 100 + 3 * joints)
     return Case(
         name="observation",
-        launch=lambda: write_observation(step, sim.terrain_of_env, sim.bank.terrain, sim.sensors, Noise(), seed, out),
+        launch=lambda: write_observation(step, sim.terrain_of_env, sim.bank.terrain, sim.sensors, None, seed, out),
         output=out,
         counterpart=counterparts.observation,
         arguments=(*tensors, constant(*sim.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.coordinates import Delay, SolverState, from_solver, poses_from_solver, to_solver
-from kernels.observation import Noise, Sensors, apply_action, write_observation
+from kernels.observation import Sensors, apply_action, write_observation
 from kernels.state import RobotStep
 from sim.mujoco_c.model import observations, to_mujoco
 from tests.kernels.states import filled, make_terrain, random_states, rough, upright
@@ -26,7 +26,7 @@ def observe(states, command, last_action, terrain_of_env, grids, scan):
     state = {name: np.float32(array) for name, array in zip(names, (*states, command, last_action), strict=True)}
     on, seed = wp.array(terrain_of_env, dtype=int), wp.array([0], dtype=int)
     step, sensors = filled(RobotStep, base_com=BASE_COM, **state), make_sensors(num_joints, scan)
-    write_observation(step, on, make_terrain(grids), sensors, Noise(), seed, out)
+    write_observation(step, on, make_terrain(grids), sensors, None, seed, out)
     return out.numpy()
 
 

@@ -4,14 +4,13 @@ One control step is one captured graph: action, physics, end of episodes, reward
 pushes, observation. The host copies actions in and results out, and draws no random number.
 """
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
 
 from kernels.episode import Outcome, latch_outcomes, make_episodes, note_base_forces
-from kernels.observation import Noise, apply_action
+from kernels.observation import apply_action
 from kernels.queue import StartRanges
 from kernels.rewards import REWARDS, remember_steps
 from kernels.training import (
@@ -73,7 +72,7 @@ class CommandTask:
         self._task = _make_task(cfg, robot)
         self._rules = _make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
         self._ranges = _make_start_ranges(cfg, robot)
-        self._noise = _fill(Noise(), **asdict(cfg.noise))
+        self._noise = self.sim.make_noise(cfg.noise)
         self.max_episode_steps: int = self._task.max_steps
         self._episodes = make_episodes(num_envs, device)
         self._training = training = make_training(

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from kernels.conditions import BASE, DisturbedStep, VariedRobots
 from kernels.episode import Outcome
-from kernels.observation import noise_width
 from sim.robots.training import NoiseCfg
 from sim.terrains.quantities import Quantity, Sweep
 
@@ -324,16 +323,7 @@ def _disturb_noise(step: DisturbedStep, row: wp.array[float], first: int, env: i
         # Drawn by the episode's own stream: neither robot nor slot changes an episode.
         number = step.memory.age[env, column] * step.observation.shape[1] + column
         state = wp.rand_init(int(step.episodes.rng[env]), number)
-        width = noise_width(step.memory.noise, step.sensors, column)
-        step.observation[env, column] += row[first] * width * wp.randf(state, -1.0, 1.0)
-
-
-def noise_widths(robot: Any) -> NDArray[np.float64]:
-    """Half widths of legged_gym's noise of each column of an observation, shape (observation_size,)."""
-    noise = NoiseCfg()
-    widths = [2.0 * noise.lin_vel, 0.25 * noise.ang_vel, noise.gravity, 0.0, 0.0]
-    widths += [noise.joint_pos, 0.05 * noise.joint_vel, 0.0, 5.0 * noise.scan, 0.0, 0.5 * noise.gravity, 0.0, 0.0]
-    return np.repeat(widths, robot.column_sizes)
+        step.observation[env, column] += row[first] * step.memory.noise[column] * wp.randf(state, -1.0, 1.0)
 
 
 class ObservationNoise(Condition):
@@ -348,7 +338,7 @@ class ObservationNoise(Condition):
 
     def disturb_plain(self, episodes: Any, values: Array, rows: Array, running: Any, step: int) -> Array:
         """Adds noise, drawn otherwise than in the parallel simulation."""
-        widths = values[0] * noise_widths(episodes.robot)
+        widths = values[0] * NoiseCfg().column_widths(episodes.robot.column_sizes)
         return rows + widths * episodes.rng.uniform(-1.0, 1.0, rows.shape)
 
 

@@ -12,13 +12,13 @@ from sim.mujoco_c.crossing import EpisodeStates, draw_starts
 from sim.mujoco_c.model import Starts, crossing_model
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
+from sim.robots.training import NoiseCfg
 from sim.rollout import Rollout
 from sim.terrains.bank import make_terrains
 from sim.terrains.conditions.kinds import (
     CONDITIONS,
     condition_column,
     condition_genes,
-    noise_widths,
     nominal_row,
     round_steps,
 )
@@ -167,7 +167,7 @@ def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(any
             shared.sim.launch(shared._turn_graph)
             rows.append(shared._observation.numpy()[order].copy())
         seen[name] = np.array(rows)
-    added, widths = seen["noise"] - seen["none"], 2.0 * noise_widths(anymal)
+    added, widths = seen["noise"] - seen["none"], 2.0 * NoiseCfg().column_widths(anymal.column_sizes)
     assert (np.abs(added) <= widths + 1e-5).all() and not added[..., widths == 0.0].any()
     share = (added / np.where(widths > 0.0, widths, 1.0))[..., widths > 0.0]
     assert share.std() == pytest.approx(1 / np.sqrt(3), rel=0.05) and abs(share.mean()) < 0.05
