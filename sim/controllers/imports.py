@@ -40,15 +40,11 @@ FORMATS = (
     ({"weights"}, read_weights_alone, "weights alone (an rsl_rl checkpoint, TorchScript or ONNX)"),
 )
 """Formats of sources: the first whose marks a path has reads it into a Source, and returns the file of the weights."""
+_DRIVE_SETTINGS = (*PER_JOINT, "actuator_net", "drive_delay_steps")
+_ACTION_SETTINGS = ("policy", "joints", "action_scale", "action_offset", "action_clip")
 _SETTINGS_BY_FILE = {
-    "robot.toml": (
-        *("model_file", *PER_JOINT, "actuator_net", "drive_delay_steps", "physics_dt", "decimation", "speed"),
-        *("max_duration_s", "scan_x", "scan_y"),
-    ),
-    "controller.toml": (
-        *("policy", "joints", "action_scale", "action_offset", "action_clip", "observation_clip", "activation"),
-        *("history", "observation"),
-    ),
+    "robot.toml": ("model_file", *_DRIVE_SETTINGS, "physics_dt", "decimation", "speed", "scan_x", "scan_y"),
+    "controller.toml": (*_ACTION_SETTINGS, "observation_clip", "activation", "history", "observation"),
 }
 
 
@@ -62,11 +58,10 @@ def _list_marks(path: Path) -> set[str]:
         return {"weights", *read_metadata(file)}
     if file.is_file() and file.suffix not in (*YAML_SUFFIXES, ".json"):
         return {"weights"}
-    marks = {file.relative_to(path).as_posix()}
-    if file.is_file() and "params/env.yaml" not in marks:  # which is long, and there is no other
-        content = read_yaml(file)
-        marks |= {*content}.union(*(map("*.{}".format, table) for table in content.values() if isinstance(table, dict)))
-    return marks
+    if not file.is_file() or file.name == "env.yaml":  # which is long
+        return {file.relative_to(path).as_posix()}
+    content = read_yaml(file)
+    return {*content}.union(*(map("*.{}".format, table) for table in content.values() if isinstance(table, dict)))
 
 
 def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:

@@ -363,14 +363,13 @@ def _refused_elements(spec: Any) -> Iterator[str]:
                 yield f"<{kind} {name}> of {element.name} ({element.info})"
     for joint in joints:
         is_free = joint.type == mj.mjtJoint.mjJNT_FREE
-        if joint.type == mj.mjtJoint.mjJNT_BALL:
-            yield f"a ball joint ({joint.info})"
-        if not (is_free or joint.name):
-            yield f"a joint without a name ({joint.info})"
-        if np.any(joint.damping[1:]):
-            yield f"<joint damping> of {joint.name} ({joint.info})"
-        if np.any(joint.stiffness[0 if is_free else 1 :]):
-            yield f"<joint stiffness> of {joint.name} ({joint.info})"
+        refused = {
+            "a ball joint": joint.type == mj.mjtJoint.mjJNT_BALL,
+            "a joint without a name": not (is_free or joint.name),
+            f"<joint damping> of {joint.name}": np.any(joint.damping[1:]),
+            f"<joint stiffness> of {joint.name}": np.any(joint.stiffness[0 if is_free else 1 :]),
+        }
+        yield from (f"{what} ({joint.info})" for what, is_refused in refused.items() if is_refused)
     for geom in geoms:
         if geom.type in (mj.mjtGeom.mjGEOM_HFIELD, mj.mjtGeom.mjGEOM_SDF):
             yield f"a height field or distance field as geom {geom.name} ({geom.info})"

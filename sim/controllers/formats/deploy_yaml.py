@@ -29,15 +29,13 @@ def read_deploy_yaml(path: Path, source: Source) -> Path:
         slots = sorted(motors) if len(gains) == len(motors) else range(len(gains))  # motors that are not there
         content[name] = [gains[slots.index(motor)] for motor in motors]
     names = ("stiffness", "damping", "default_joint_pos")
-    default = dict(zip(joints, content["default_joint_pos"], strict=True))
     source.move(content, dict(zip(names, names, strict=True)), joints)
     reason = f"{file.name} says the control step alone; the tasks of its makers have {_STEPS} physics steps in it"
     source.set(physics_dt=round(content.pop("step_dt") / _STEPS, 6), decimation=_STEPS, reason=reason)
     actions = content.pop("actions")
     for name, action in actions.items():
         moved = _select_joints(action.get("joint_ids"), joints)
-        is_usual = action.get("offset") == [default[joint] for joint in moved]
-        action |= {"class_type": name, "joint_names": moved, "preserve_order": True, "use_default_offset": is_usual}
+        action |= {"class_type": name, "joint_names": moved, "preserve_order": True, "use_default_offset": False}
     reason = "the order in which the motors of a limb follow each other; joints are numbered, not named"
     read_action(actions, joints, reason, source)
     source.set(joints=source.settings.get("joints", joints), reason=reason)

@@ -144,9 +144,10 @@ def read_action(
     scale = per_joint(term["scale"], joints, f"{label}.scale")
     source.set(action_scale=collapse(scale))
     pose = dict(zip(source.joints, per_joint(source.settings["default_joint_pos"], source.joints, label), strict=True))
-    offset = [pose[joint] for joint in joints]
+    offset = default = [pose[joint] for joint in joints]
     if not term.get("use_default_offset", True):
         offset = [angle or 0.0 for angle in per_joint(term["offset"], joints, f"{label}.offset", partly=True)]
+    if offset != default:
         source.set(action_offset=offset)
     if limit is not None:
         source.set(action_clip=limit)
