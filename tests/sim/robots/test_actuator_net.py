@@ -71,9 +71,8 @@ def test_torques_are_those_of_the_module_in_both(tmp_path, device, kind):
         sim.physics_step()
         plain.step(np.arange(2))
         if kind == "dense":
-            expected = module(
-                torch.stack([past[0, :, 1], past[3, :, 1], -2 * past[0, :, 0], -2 * past[3, :, 0]], dim=1)
-            )
+            (error, velocity), (old_error, old_velocity) = (past[ago].T for ago in (0, 3))
+            expected = module(torch.stack([velocity, old_velocity, -2 * error, -2 * old_error], dim=1))
         elif step % 9 % 2 == 0:
             answer, state = module(past[0][:, None], state)
             expected = (-2.0 * answer).clip(-30.0, 30.0)
