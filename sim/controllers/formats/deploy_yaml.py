@@ -28,8 +28,7 @@ def read_deploy_yaml(path: Path, source: Source) -> Path:
         gains = content[name]
         slots = sorted(motors) if len(gains) == len(motors) else range(len(gains))  # motors that are not there
         content[name] = [gains[slots.index(motor)] for motor in motors]
-    names = ("stiffness", "damping", "default_joint_pos")
-    source.move(content, dict(zip(names, names, strict=True)), joints)
+    source.move(content, {name: name for name in ("stiffness", "damping", "default_joint_pos")}, joints)
     reason = f"{file.name} says the control step alone; the tasks of its makers have {_STEPS} physics steps in it"
     source.set(physics_dt=round(content.pop("step_dt") / _STEPS, 6), decimation=_STEPS, reason=reason)
     actions = content.pop("actions")

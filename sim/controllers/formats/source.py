@@ -24,8 +24,6 @@ _NAMES_BY_TERM = {
 }
 TERM_NAMES = {name: term for term, names in _NAMES_BY_TERM.items() for name in names}
 """Terms of the observation by the names that rl_sar and mjlab give them."""
-CLOCK_PERIOD = 0.8
-"""Of the clock in the code of rl_sar and unitree_rl_gym [s]."""
 BLIND_TERMS = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
 """Terms of a controller without sight, in the usual order."""
 SETTINGS = ("default_joint_pos", "stiffness", "damping", "action_scale", "physics_dt", "decimation")
@@ -134,12 +132,11 @@ class Source:
     def joint_paths(self) -> list[list[str]]:
         """The names of joints from the base to each joint."""
         model = self.model
-        names = {int(model.jnt_bodyid[k]): model.joint(k).name for k in range(1, model.njnt)}
-
-        def path_to(body: int) -> list[str]:
-            return [*path_to(int(model.body_parentid[body])), names[body]] if body in names else []
-
-        return [path_to(body) for body in names]
+        paths: dict[int, list[str]] = {}
+        for k in range(1, model.njnt):  # parents come first
+            body = int(model.jnt_bodyid[k])
+            paths[body] = [*paths.get(int(model.body_parentid[body]), ()), model.joint(k).name]
+        return [*paths.values()]
 
     def sort_breadth_first(self) -> list[str]:
         """Joints from the base outwards, a body's children by name, as PhysX orders them."""
@@ -165,8 +162,8 @@ def make_term(name: str, scale: Any = None, **fields: Any) -> dict[str, Any]:
 
 
 def make_terms(names: Iterable[str], scales: Mapping[str, Any], **fields: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Terms of the observation with their scales and fields; a clock has the usual period."""
-    fields = {"clock": {"period_s": CLOCK_PERIOD}} | fields
+    """Terms of the observation with their scales and fields; a clock has the period of rl_sar and unitree_rl_gym."""
+    fields = {"clock": {"period_s": 0.8}} | fields
     return [make_term(name, scales.get(name), **fields.get(name, {})) for name in names]
 
 
