@@ -234,8 +234,8 @@ class ImportCommand:
     """
 
     source: tyro.conf.Positional[Path]
-    """A folder or YAML of rl_sar, a YAML of unitree_rl_gym's deploy_mujoco, an ONNX file of mjlab, a run folder of
-    Isaac Lab, or weights alone."""
+    """A YAML or folder of rl_sar, unitree_rl_gym, unitree_rl_lab (deploy.yaml), legged_gym, Booster Gym or LEAPP, a run
+    folder of Isaac Lab, an ONNX file of mjlab or holosoma, or weights alone."""
     model: str | None = None
     """The robot's MJCF or URDF, which stays where it is, or a robot of MuJoCo Menagerie: menagerie:unitree_go2. If left
     out, the file that the source names, if it is here."""

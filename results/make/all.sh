@@ -48,6 +48,11 @@ done
 if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as results/make/public.toml says
   "$python" -m results.make.public "$PUBLIC"                            # 50 min
   "$python" -m results.make.public "$PUBLIC" --films                    # some minutes, no GPU
+  imports=$(ls -td runs/make/*/public | head -1)
+  "$python" -m results.make.planted "$imports"/{go2-himloco,lite3-himloco,g1-29-unitree-lab}/robot.toml --seed 1 # 8 min
+fi
+if [ -n "${ANYDRIVE:-}" ]; then # legged_gym's resources/actuator_nets/anydrive_v3_lstm.pt
+  "$python" -m results.make.drive --robot anymal --net "$ANYDRIVE"      # 10 min
 fi
 "$python" -m tests.bench                                              # 3 min
 FAULTLINE_DEVICE=cuda:0 "$python" -m pytest -q -m gpu --record=results/bench/gpu-tests.json # 4 min

@@ -61,7 +61,7 @@ class Term:
     """Left of it [m]; the robot's ``scan_y`` if None."""
     offset: float | tuple[float, ...] | None = None
     """Subtracted from the height over the ground [m] or from angles [rad]; of a clock: of each foot, in periods."""
-    value: float | tuple[float, ...] = 0.0
+    value: float | tuple[float, ...] | None = None
     """Numbers that never change."""
     axes: Annotated[str, Meta(pattern="^(roll|pitch|yaw)( (roll|pitch|yaw))*$")] | None = None
     """Angles of the base that are seen, in their order."""

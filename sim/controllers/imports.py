@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sim.controllers.described import read_controller
 from sim.controllers.formats.booster import read_booster
 from sim.controllers.formats.deploy_yaml import read_deploy_yaml
 from sim.controllers.formats.holosoma import read_holosoma
@@ -14,6 +15,7 @@ from sim.controllers.formats.isaac_lab import read_isaac_lab
 from sim.controllers.formats.leapp import read_leapp
 from sim.controllers.formats.legged_gym import read_legged_gym
 from sim.controllers.formats.mjlab import read_mjlab
+from sim.controllers.formats.network import load_network
 from sim.controllers.formats.onnx_data import read_metadata
 from sim.controllers.formats.rl_sar import read_rl_sar
 from sim.controllers.formats.source import Source
@@ -84,25 +86,33 @@ def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
     if reader is None:
         raise ValueError(f"{path} must be {', or '.join(label for *_, label in FORMATS)}")
     weights_file = _read(reader, label, path, source)
+    load_network(weights_file, "cpu", None, label="it", activation=source.settings.get("activation"))  # or is refused
+    if weights_file.name in _SETTINGS_BY_FILE:
+        raise ValueError(f"{weights_file} must have another name, since the file of that name is written: rename it")
     copies = {file: out / file.name for file in (weights_file, data_file(weights_file)) if file is not None}
     for file, copy in copies.items():
         if copy.exists() and copy.read_bytes() != file.read_bytes():
             raise ValueError(f"{copy} must be a copy of {file}, got other weights: move them away first")
-    out.mkdir(parents=True, exist_ok=True)
     model_file = source.model_file
     is_named = model_file is None or str(model).startswith(MENAGERIE)
     model_setting = str(model) if is_named else os.path.relpath(model_file.resolve(), out.resolve())
     source.set(model_file=Path(model_setting), policy=weights_file.name)
+    texts = {
+        file: "".join(f"{_format_setting(name, source)}\n" for name in names if name in source.settings)
+        for file, names in _SETTINGS_BY_FILE.items()
+    }
+    order = [name for names in _SETTINGS_BY_FILE.values() for name in names]
+    gaps = [name for name in order if source.settings.get(name, "") is None]
+    if not {*gaps} & {*_SETTINGS_BY_FILE["controller.toml"]}:
+        read_controller(out / "controller.toml", texts["controller.toml"])  # or is refused, before anything is written
+    out.mkdir(parents=True, exist_ok=True)
     print(f"{path} is read as {label}; its weights are {weights_file}, its model is {model_file}.")
     for file, copy in copies.items():
         if not copy.exists():
             shutil.copyfile(file, copy)
-    for file, names in _SETTINGS_BY_FILE.items():
-        text = "".join(f"{_format_setting(name, source)}\n" for name in names if name in source.settings)
+    for file, text in texts.items():
         (out / file).write_text(f"# Of {path.name}\n{text}", encoding="utf-8")
         print(f"\n{out / file}:\n{text}", end="")
-    order = [name for names in _SETTINGS_BY_FILE.values() for name in names]
-    gaps = [name for name in order if source.settings.get(name, "") is None]
     print(f"\nFill in {', '.join(gaps)}; then:" if gaps else "\nNext:")
     for name in ("check", "archive"):
         print(f"  {command_line(name, robot=out / 'robot.toml')}")

@@ -112,8 +112,15 @@ class _PlainLoader(yaml.SafeLoader):
         construct: Any = self.construct_sequence if isinstance(node, yaml.SequenceNode) else self.construct_mapping
         return construct(node, deep=True)
 
+    def drop_this_tag(self, node: yaml.Node) -> Any:
+        """The value of a node of a kind that TOML does not have."""
+        return self.drop_tag("", node)
+
 
 _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _PlainLoader.drop_tag)
+for _kind in ("timestamp", "binary", "set", "omap", "pairs"):
+    _PlainLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", _PlainLoader.drop_this_tag)
+_MAX_VALUES = 1_000_000  # of a YAML, its aliases written out
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
@@ -124,13 +131,19 @@ def read_yaml(file: Path) -> dict[str, Any]:
         raise ValueError(f"{file} cannot be read as YAML: {error}") from None
     if not isinstance(content, dict):
         raise ValueError(f"{file} must hold names with values, got {type(content).__name__}")
-    return content
+    left: list[Any] = [content]
+    for _ in range(_MAX_VALUES):
+        if not left:
+            return content
+        value = left.pop()
+        left += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    raise ValueError(f"{file} must hold at most {_MAX_VALUES:,} values, aliases written out, got more")
 
 
 def to_toml(value: Any) -> str:
     """A value as TOML writes it, tables in braces."""
     if isinstance(value, Mapping):
-        keys = [key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key) for key in value]
+        keys = [key if re.fullmatch(r"[\w-]+", key, re.ASCII) else json.dumps(key) for key in map(str, value)]
         return f"{{{', '.join(f'{key} = {to_toml(item)}' for key, item in zip(keys, value.values(), strict=True))}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(to_toml, value))}]"

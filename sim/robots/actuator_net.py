@@ -1,5 +1,6 @@
 """Actuator networks of files: TorchScript, read as layers that answer as it does."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from kernels.actuator_net import ACTIVATIONS
+from sim.controllers.formats.network import load_script
 from sim.controllers.spec import in_one_line
 from sim.robots.robot import ActuatorNetCfg
 
@@ -26,7 +28,7 @@ class ActuatorNet:
         """Loads the file as data; an error says what is wrong with it."""
         self._cfg = cfg
         try:
-            module = torch.jit.load(str(cfg.file), map_location="cpu").eval()
+            module = load_script(Path(cfg.file), "cpu")
             self._read_layers({name: value.double().numpy() for name, value in module.state_dict().items()}, cfg)
             if not any(self._answers_like(module, index) for index in range(len(ACTIVATIONS))):
                 raise ValueError("its layers do not answer as it does")

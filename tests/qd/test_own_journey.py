@@ -17,6 +17,7 @@ from tests.sim.terrains.spaces.spaces import write_ridges
 ROBOT, SPACE = ["--robot", "mine/dog.py"], ["--space", "mine/space.py:Ridges"]
 POLICY = ["--policy", "mine/dog_trot.py:Trot"]
 SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "2", "--replicas", "2", "--iterations", "2"]
+SIZE += ["--skip-level-ground"]
 TABLES = ["--policies", "mine=mine/dog_trot.py:Trot", "--sets", "hard_random", "--terrains", "1", "--episodes", "1"]
 COMMANDS = [
     ["archive", *ROBOT, *POLICY, *SPACE, *SIZE, "--run-dir", "run", "--workers", "1", "--device", "cpu"],

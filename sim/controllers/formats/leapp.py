@@ -8,7 +8,6 @@ import numpy as np
 import onnxruntime
 from onnx import numpy_helper
 
-from sim.controllers.formats.network import load_network
 from sim.controllers.formats.onnx_data import read_onnx
 from sim.controllers.formats.source import Source, collapse, make_term
 from sim.files.settings import read_yaml, to_toml
@@ -42,7 +41,6 @@ def read_leapp(path: Path, source: Source) -> Path:
         values = source.find_weights(pipeline["initial_values"]).read_bytes()
         if any(values[8 + int.from_bytes(values[:8], "little") :]):  # safetensors: length, header, numbers
             raise ValueError(f"{path}: initial_values must be zeros, got others in {pipeline['initial_values']}")
-    load_network(weights, "cpu", None, label="it")  # refuses a damaged file
     graph, data = read_onnx(weights)
     inputs = {port["name"]: port for port in model["inputs"]}
     ports = [inputs[port.name] for port in graph.graph.input if not inputs[port.name].get("is_state")]

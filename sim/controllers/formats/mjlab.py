@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from sim.controllers.formats.isaac_lab import read_scan
-from sim.controllers.formats.network import load_network
 from sim.controllers.formats.onnx_data import read_metadata
 from sim.controllers.formats.source import SETTINGS, TERM_NAMES, Source, collapse, make_term
 from sim.files.settings import read_yaml
@@ -17,7 +16,6 @@ _TERMS = TERM_NAMES | {"height_scan": "scan"}
 
 def read_mjlab(path: Path, source: Source) -> Path:
     """Settings of the metadata, which are rounded to three decimals; returns the file."""
-    load_network(path, "cpu", None, label="it")  # refuses a damaged file
     content: dict[str, Any] = {key: text.split(",") for key, text in read_metadata(path).items() if text}
     names = content.pop("observation_names")
     joints = content.pop("joint_names")

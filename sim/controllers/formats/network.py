@@ -3,6 +3,7 @@
 import functools
 import re
 import warnings
+import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -40,7 +41,9 @@ def load_network(
         raise ValueError(f"policy '{path}' is damaged: {error}; put a copy of it back") from error
     except Exception as error:  # a stream of pickle opcodes can fail with anything
         try:
-            module, probe = (torch.jit.load(str(path), map_location=target).eval() for target in (device, "cpu"))
+            module, probe = (load_script(path, target) for target in (device, "cpu"))
+        except ValueError:
+            raise
         except Exception as foreign:
             what = "is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module"
             why = f"(truncated, foreign, or holding code): {in_one_line(error)}"
@@ -54,6 +57,15 @@ def load_network(
         remedy = "give one that fits, or describe it (docs/controllers.md)"
         raise ValueError(f"policy '{path}' {what}, but {must}: {remedy}")
     return policy.to(device).eval()
+
+
+def load_script(path: Path, device: str) -> Any:
+    """A TorchScript module; one whose code reads or writes files is a ValueError, since it may run on loading."""
+    with zipfile.ZipFile(path) as archive:
+        code = b"".join(archive.read(name) for name in archive.namelist() if name.endswith(".py"))
+    if command := re.search(rb"\bfrom_file\b|\b(torch|aten)\.save\b", code):
+        raise ValueError(f"policy '{path}' must be a network alone, but calls {command[0].decode()}: do not trust it")
+    return torch.jit.load(str(path), map_location=device).eval()
 
 
 def find_widths(network: Any) -> tuple[int | None, int | None]:

@@ -13,9 +13,9 @@ _WITHOUT_EFFECT = ("fixed_kp", "fixed_kd", "num_of_dofs", "num_observations", "j
 
 
 def read_rl_sar(path: Path, source: Source) -> Path:
-    """Settings of a YAML, or of a folder's config.yaml, over base.yaml, which is beside it or in the folder above."""
+    """Settings of a YAML, or of a folder's config.yaml, over base.yaml, which is beside it or two above."""
     source.file = file = path / "config.yaml" if path.is_dir() else path
-    bases = [folder / "base.yaml" for folder in (file.parent, file.parent.parent)]
+    bases = [folder / "base.yaml" for folder in file.resolve().parents[:3]]
     base = next(filter(Path.is_file, bases), None)
     if base is None:
         raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")

@@ -1,5 +1,7 @@
 """What trainings and vendors leave becomes a robot and a controller, which load and mean the same."""
 
+import datetime
+import functools
 import hashlib
 import json
 import re
@@ -492,6 +494,8 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (rl_sar, {"joint_mapping": [9] * 8}, "must be a controller of rl_sar"),
         (deployment, {"num_obs": 40}, "num_obs"),
         (deployment, {"num_actions": 7}, "num_actions"),
+        (deployment, {"action_scale": datetime.date(2020, 1, 1)}, "action_scale"),
+        (deployment, {"kds": functools.reduce(lambda values, _: [values] * 9, range(9), [0.0])}, "at most 1,000,000"),
         (legged_gym, {"control_type": "T"}, "control_type"),
         (legged_gym, {"hip_scale_reduction": 0.5}, "hip_scale_reduction"),
         (legged_gym, {"stiffness": {"hip": 20.0}}, "none of FL_knee"),

@@ -2,6 +2,7 @@
 what their names mean; and the runner that calls them."""
 
 import hashlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,6 +77,11 @@ def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path, anymal, state):
         load_policy(save_checkpoint(tmp_path / "model.pt", state), anymal, "cpu")
 
 
+class Writes(torch.nn.Module):
+    def forward(self, rows):
+        return rows[:, :12] + torch.from_file("written", True, 12)
+
+
 @pytest.mark.filterwarnings("ignore:.torch.jit")
 def test_a_damaged_or_foreign_file_is_refused(tmp_path, anymal):
     path = save_checkpoint(tmp_path / "model.pt", STATE)
@@ -87,7 +93,7 @@ def test_a_damaged_or_foreign_file_is_refused(tmp_path, anymal):
     for content in ({"model_state_dict": {}, "iter": 3}, {"model_state_dict": 3}, torch.zeros(3)):
         torch.save(content, path)
         contents.append(path.read_bytes())
-    for other in (torch.nn.Linear(169, 10), torch.nn.LSTM(OBSERVATIONS, ACTIONS)):  # which returns its state too
+    for other in (torch.nn.Linear(169, 10), torch.nn.LSTM(OBSERVATIONS, ACTIONS), Writes()):
         torch.jit.script(other).save(str(path))
         contents.append(path.read_bytes())
     for content in contents:
@@ -95,6 +101,7 @@ def test_a_damaged_or_foreign_file_is_refused(tmp_path, anymal):
         with pytest.raises(ValueError, match=r"model\.pt") as raised:
             load_policy(path, anymal, "cpu")
         assert "internal miniz" not in str(raised.value) and ":callable" not in str(raised.value)
+    assert not Path("written").exists()
     with pytest.raises(ValueError, match=r"gone\.pt"):
         load_policy(tmp_path / "gone.pt", anymal, "cpu")
 
