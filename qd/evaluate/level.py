@@ -5,6 +5,7 @@ controller, and stored beside the penalty scales as ``<name>.level.json``.
 """
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -66,22 +67,26 @@ def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = Fals
 
 
 def give_time(robot: RobotCfg, policy: str, compute: Compute) -> RobotCfg:
-    """The robot of a robot.toml with the time that a crossing needs, written there; a time that it says stands.
+    """The robot of a robot.toml with the time that a crossing needs, written there; a time that the user wrote stands.
 
     That is 12 m at the speed toward the goal on level ground, times 1.25, and at least 20 s. Nothing is written of a
     controller that does not walk.
     """
     file = robot.settings_file
-    if file is None or file.suffix != ".toml" or "max_duration_s" in read_toml(file):
+    if file is None or file.suffix != ".toml":
+        return robot
+    is_ours = re.search(rf"^max_duration_s = .*# {_DISTANCE:g} m at", file.read_text(encoding="utf-8"), re.MULTILINE)
+    if "max_duration_s" in read_toml(file) and not is_ours:
         return robot
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
         speed = measure_level_ground(crosser, policy)["searched"]["speed"]
     needed = math.ceil(10.0 * _SPARE_TIME * _DISTANCE / max(speed, _MIN_SPEED)) / 10.0
-    if speed < _MIN_SPEED or needed <= robot.max_duration_s:
+    needed = max(needed, RobotCfg.max_duration_s)
+    if speed < _MIN_SPEED or abs(needed - robot.max_duration_s) < 0.02 * needed:
         return robot
     reason = f"{_DISTANCE:g} m at {speed:.3f} m/s, times {_SPARE_TIME:g}"
     write_setting(file, "max_duration_s", needed, reason)
-    print(f"A crossing gets more time: {file} now has max_duration_s = {needed:g}, {reason}.", flush=True)
+    print(f"A crossing gets another time: {file} now has max_duration_s = {needed:g}, {reason}.", flush=True)
     return replace(robot, max_duration_s=needed)
 
 

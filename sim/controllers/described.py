@@ -15,7 +15,7 @@ from msgspec import Meta
 from kernels.observation import ANG_VEL_SCALE, FORCE_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE, SCAN_OFFSET, SCAN_SCALE
 from sim.controllers.formats.rsl_rl import ACTIVATIONS
 from sim.controllers.runner import is_graph_safe
-from sim.files.settings import NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, read_toml, to_toml
+from sim.files.settings import NonNegativeInt, PositiveFloat, from_builtins, read_toml, to_toml
 from sim.robots.robot import RobotCfg, needed_senses
 
 TERMS: dict[str, tuple[str, ...]] = {
@@ -42,7 +42,7 @@ class Term:
     """Largest size, or limits, in the quantity's unit, before ``scale``."""
     scale: float | tuple[float, ...] = 1.0
     """One factor, or one a column."""
-    history: PositiveInt | None = None
+    history: Annotated[int, Meta(ge=1, le=10_000)] | None = None
     """Number of control steps that the controller sees; as :class:`History` has it if None."""
     at: tuple[float, float, float] | None = None
     """Where the velocity is measured, for example by the IMU, base frame [m]; at the base link's origin if None."""
@@ -73,7 +73,7 @@ class Term:
 class History:
     """How observations of former control steps are laid out."""
 
-    length: PositiveInt
+    length: Annotated[int, Meta(ge=1, le=10_000)]
     """Control steps that the controller sees, with the present one."""
     newest: Annotated[str, Meta(pattern="^(first|last)$")]
     by: Annotated[str, Meta(pattern="^(row|term)$")]
@@ -351,7 +351,7 @@ class Described(torch.nn.Module):
         if term.term != "scan":
             waves = len((term.order or "").split())
             sizes = {"last_action": self.num_actions, "contacts": len(robot.foot_geoms)}
-            sizes |= {"constant": np.size(term.value), "clock": waves * np.size(term.offset or 0.0)}
+            sizes |= {"constant": np.size(term.value or 0.0), "clock": waves * np.size(term.offset or 0.0)}
             return range(sizes.get(term.term, 3))
         x, y = (np.round(values, 4).tolist() for values in (term.x or robot.scan_x, term.y or robot.scan_y))
         points = [(a, b) for b in y for a in x] if term.order == "x fastest" else [(a, b) for a in x for b in y]

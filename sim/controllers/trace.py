@@ -29,13 +29,17 @@ def read_log(file: Path, robot: RobotCfg) -> dict[str, torch.Tensor]:
         if file.suffix == ".csv":
             header = file.read_text(encoding="utf-8").partition("\n")[0].strip().split(",")
             columns = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2).T
-            names = np.array([name.strip().rpartition("_")[0] for name in header])
-            log = {str(name): columns[names == name].T for name in dict.fromkeys(names)}
+            parts = [name.strip().rpartition("_") for name in header]
+            order = sorted(range(len(parts)), key=lambda k: int(parts[k][2]))
+            names = [parts[k][0] for k in order]
+            log = {name: columns[[k for k in order if parts[k][0] == name]].T for name in dict.fromkeys(names)}
         else:
             log = read_arrays(file)
         if "observation" not in log or not log.keys() <= shapes.keys():
             raise ValueError(f"it must have observation, and some of {', '.join(shapes)}, got {', '.join(log)}")
         check_shapes(log, shapes)
+        if not len(log["observation"]) or not all(np.isfinite(values).all() for values in log.values()):
+            raise ValueError("it must have steps, and finite numbers alone")
         return {name: torch.as_tensor(np.asarray(values, np.float32)) for name, values in log.items()}
     except Exception as error:  # a damaged file can fail with anything
         raise ValueError(f"{file} must be a log, an npz or csv (docs/controllers.md): {error}") from None
@@ -89,6 +93,8 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
     if unknown:
         print(f"Not compared, since {file.name} lacks what they are made of: {', '.join(dict.fromkeys(unknown))}.")
     seen = torch.where(torch.tensor([name in unknown for name in names]), observation, torch.cat(rebuilt))
+    if len(unknown) == len(names) and "action" not in log:
+        return [f"{file} has nothing to compare with {policy}: give it what joints and base measured, or actions"]
     lines = _compare("observation", seen, observation, labels)
     if "action" in log:
         lines += _compare("action", torch.cat(answers), log["action"], controller.cfg.joints or robot.joint_names)
@@ -102,8 +108,8 @@ def _compare(name: str, ours: torch.Tensor, theirs: torch.Tensor, labels: Sequen
         return []
     step, column = torch.nonzero(differs)[0].tolist()
     our, their = float(ours[step, column]), float(theirs[step, column])
-    ratio = ours[differs[:, column], column] / theirs[differs[:, column], column]
-    same = (ratio - ratio[0]).abs().max() < _TOLERANCE * ratio[0].abs()
+    ratio = our / their if their else 0.0
+    same = ratio and torch.allclose(ours[:, column], ratio * theirs[:, column], rtol=_TOLERANCE, atol=_TOLERANCE)
     values = f"{their:.4g} in the log, {our:.4g} by the contract, off by {our - their:.4g}"
     line = f"{name} {column} ({labels[column]}) at step {step}: {values}; {int(differs.any(0).sum())} columns differ"
-    return [line + f"; it is {ratio[0]:.4g} times the log's at every step" * bool(same)]
+    return [line + f"; it is {ratio:.4g} times the log's at every step" * bool(same)]

@@ -117,17 +117,25 @@ def test_a_log_is_compared_column_by_column(dog, tmp_path):
         lines = compare_log(file, description, base.robot)
         assert len(lines) == bool(texts) and all(text in lines[0] for text in texts), (name, lines)
     header = ",".join(f"{name}_{k}" for name, values in log.items() for k in range(values.shape[1]))
-    np.savetxt(tmp_path / "log.csv", np.hstack([*log.values()]), delimiter=",", header=header, comments="")
+    columns = np.hstack([*log.values()])[:, ::-1]  # whose names say their order
+    header = ",".join(header.split(",")[::-1])
+    np.savetxt(tmp_path / "log.csv", columns, delimiter=",", header=header, comments="")
     assert compare_log(tmp_path / "log.csv", description, base.robot) == []
 
 
 @pytest.mark.parametrize(
     ("name", "shape", "field"),
-    [("action", (3, 8), "observation"), ("torque", (3, 8), "torque"), ("joint_pos", (3, 7), "joint_pos")],
+    [
+        ("action", (3, 8), "observation"),
+        ("torque", (3, 8), "torque"),
+        ("joint_pos", (3, 7), "joint_pos"),
+        ("ang_vel", (3, 3), "finite"),
+        ("observation", (0, 8), "steps"),
+    ],
 )
 def test_a_log_that_says_something_else_is_refused(dog, tmp_path, name, shape, field):
     file = tmp_path / "log.npz"
     observation = {} if field == "observation" else {"observation": np.zeros((3, 8))}
-    file.write_bytes(npz_bytes({name: np.zeros(shape), **observation}))
+    file.write_bytes(npz_bytes({**observation, name: np.full(shape, np.nan if field == "finite" else 0.0)}))
     with pytest.raises(ValueError, match=field):
         compare_log(file, str(dog[1].with_name("controller.toml")), dog[0].robot)

@@ -19,10 +19,10 @@ def read_deploy_yaml(path: Path, source: Source) -> Path:
     """
     source.file = file = path / "params" / "deploy.yaml" if path.is_dir() else path
     content = read_yaml(file)
-    motors = [int(motor) for motor in content.pop("joint_ids_map")]
-    if len(motors) != len(source.joints):
-        must = f"must number {len(source.joints)}, the joints of {source.model_file}"
-        raise ValueError(f"{file}: joint_ids_map {must}, got {len(motors)}")
+    motors = content.pop("joint_ids_map")
+    if len({*motors}) != len(source.joints) or not all(isinstance(motor, int) for motor in motors):
+        must = f"must number {len(source.joints)} motors once, the joints of {source.model_file}"
+        raise ValueError(f"{file}: joint_ids_map {must}, got {motors}")
     joints = _find_order(motors, source)
     for name in ("stiffness", "damping"):
         gains = content[name]

@@ -39,7 +39,8 @@ def read_leapp(path: Path, source: Source) -> Path:
         raise ValueError(f"{weights} must have sha256sum {parameters['sha256sum']}: give the file of this YAML")
     if "initial_values" in pipeline:
         values = source.find_weights(pipeline["initial_values"]).read_bytes()
-        if any(values[8 + int.from_bytes(values[:8], "little") :]):  # safetensors: length, header, numbers
+        numbers = values[8 + int.from_bytes(values[:8], "little") :]  # safetensors: length, header, numbers
+        if any(numbers) or not numbers:
             raise ValueError(f"{path}: initial_values must be zeros, got others in {pipeline['initial_values']}")
     graph, data = read_onnx(weights)
     inputs = {port["name"]: port for port in model["inputs"]}

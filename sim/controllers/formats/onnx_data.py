@@ -8,6 +8,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
+_PAGE = 65_536  # bytes to which a file of weights may be filled up
+
 
 def find_data_file(path: Path) -> Path | None:
     """The one file beside an ONNX file that it names for its weights; None if it names none."""
@@ -16,6 +18,8 @@ def find_data_file(path: Path) -> Path | None:
     file = path.parent / next(iter(names), "")
     if outside and ({file.name} != names or file.resolve().parent != path.parent.resolve()):
         raise ValueError(f"it must keep its tensors in one file beside it, got {len(outside)} in {', '.join(names)}")
+    if outside and not file.is_file():
+        raise ValueError(f"it keeps its weights in {file.name}, which is not beside it: copy both files")
     return file if outside else None
 
 
@@ -24,6 +28,7 @@ def read_onnx(path: Path) -> tuple[Any, bytes]:
     model, outside = _read_graph(path)
     file = find_data_file(path)
     data = file.read_bytes() if file else b""
+    used = 0
     for tensor in outside:
         fields = {field.key: field.value for field in tensor.external_data}
         size = int(np.prod(tensor.dims)) * helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
@@ -31,9 +36,12 @@ def read_onnx(path: Path) -> tuple[Any, bytes]:
         if length != size or not 0 <= start <= len(data) - size:
             got = f"{length} from {start} on in {file} of {len(data)}"
             raise ValueError(f"'{tensor.name}' must have {size} bytes, got {got}: copy both files of one export")
+        used = max(used, start + size)
         tensor.raw_data = data[start : start + size]
         tensor.data_location = TensorProto.DEFAULT
         del tensor.external_data[:]
+    if len(data) > used + _PAGE:
+        raise ValueError(f"{file} must have {used:,} bytes, got {len(data):,}: copy both files of one export")
     return model, model.SerializeToString() if outside else path.read_bytes()
 
 

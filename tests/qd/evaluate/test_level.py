@@ -49,6 +49,7 @@ def robots(x, *, time_s=20.0, goals=20):
         ("", 2.0 + 0.14 * 20.0, 20.0, 20.0),  # 0.14 m/s: it does not walk
         ("", -3.0, 20.0, 20.0),  # away from the goal
         ("max_duration_s = 25.0\n", 12.0, 20.0, 25.0),  # the user's
+        ("max_duration_s = 25.0  # 12 m at 0.600 m/s, times 1.25\n", 12.0, 20.0, 30.0),  # of another contract
     ],
 )
 def test_a_slow_controller_gets_the_time_that_it_needs(dog, more, x, time_s, expected):

@@ -513,6 +513,7 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (isaac_lab, {"old": "ray_alignment: yaw", "new": "ray_alignment: world"}, "yaw"),
         (lambda folder: deploy(folder, ("gait_phase", "height_scan")), {}, "height_scan"),
         (lambda folder: deploy(folder, (", 7, 5]", ", 7]")), {}, "joint_ids_map"),
+        (lambda folder: deploy(folder, (", 7, 5]", ", 7, 7]")), {}, "joint_ids_map"),
         (lambda folder: deploy(folder, ("step_dt:", "gear: 1\nstep_dt:")), {}, "gear"),
         (holosoma, {"experiment_config": None}, "the locomotion of G1 or T1, got 74 columns"),
         (leapp, {"parameters": {"model_path": "policy.onnx", "sha256sum": "0"}}, "policy.onnx must have sha256sum 0"),

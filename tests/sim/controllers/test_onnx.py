@@ -160,8 +160,11 @@ def test_weights_in_a_file_beside_it_belong_to_the_controller(tmp_path, anymal):
     before = controller_hash(path)
     data.write_bytes(data.read_bytes()[::-1])
     assert before != controller_hash(path)
+    data.write_bytes(bytes(200_000))
+    with pytest.raises(ValueError, match=r"policy\.onnx\.data must have"):
+        load_policy(path, anymal, "cpu")
     data.unlink()
-    with pytest.raises(ValueError, match=r"policy\.onnx\.data"):
+    with pytest.raises(ValueError, match=r"policy\.onnx\.data, which is not beside it"):
         load_policy(path, anymal, "cpu")
 
 
