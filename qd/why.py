@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.workers.compute import Compute
-from sim.controllers.described import ControllerCfg, Described, Term, read_controller
+from sim.controllers.described import ROW_SCALES, ControllerCfg, Described, Term, read_controller
 from sim.controllers.formats.source import collapse
 from sim.controllers.spec import weights_file
 from sim.files.settings import to_toml
@@ -199,9 +199,7 @@ def explain_walk(robot: RobotCfg, policy: str, compute: Compute) -> None:
 
 def describe_row(robot: RobotCfg) -> ControllerCfg:
     """The description of weights that see the robot's row (docs/controllers.md)."""
-    scales = {"lin_vel": 2.0, "ang_vel": 0.25, "gravity": 1.0, "command": (2.0, 2.0, 0.25), "joint_pos": 1.0}
-    scales |= {"joint_vel": 0.05, "last_action": 1.0}
-    terms = [Term(term=name, scale=scale) for name, scale in scales.items()]
+    terms = [Term(term=name, scale=scale) for name, scale in ROW_SCALES.items()]
     if robot.num_scan_points:
         terms.append(Term(term="scan", order="y fastest", offset=0.5, clip=1.0, scale=5.0))
     return ControllerCfg(policy="", action_scale=robot.action_scale, action_clip=100.0, observation=tuple(terms))

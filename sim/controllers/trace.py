@@ -2,28 +2,24 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from kernels.observation import ANG_VEL_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE
-from sim.controllers.described import Described
+from sim.controllers.described import ROW_SCALES, Described
 from sim.controllers.loaders import load_policy
 from sim.controllers.runner import reset_all
 from sim.files.npz import check_shapes, read_arrays
 from sim.robots.robot import RobotCfg
 
 _NEEDS = {"scan": ("scan",), "last_action": ("action",), "lin_vel": ("lin_vel", "ang_vel"), "clock": (), "constant": ()}
-_SCALES: dict[str, Any] = {"lin_vel": LIN_VEL_SCALE, "ang_vel": ANG_VEL_SCALE, "gravity": 1.0}
-_SCALES |= {"command": (LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE), "joint_pos": 1.0, "joint_vel": JOINT_VEL_SCALE}
-"""Of the columns of a robot's row, in their order."""
+_MEASURED = {name: scale for name, scale in ROW_SCALES.items() if name != "last_action"}  # what a log may hold
 _TOLERANCE = 2e-3  # of numbers that took another road, relative to their size, at least 1
 
 
 def read_log(file: Path, robot: RobotCfg) -> dict[str, torch.Tensor]:
     """Arrays of a log by name, of shape (num_steps, width): an npz, or a csv with columns ``joint_pos_0``, ..."""
-    shapes = {name: ("steps", robot.num_joints if name.startswith("joint") else 3) for name in _SCALES}
+    shapes = {name: ("steps", robot.num_joints if name.startswith("joint") else 3) for name in _MEASURED}
     shapes |= {"observation": ("steps", "columns"), "action": ("steps", "actions")}
     try:
         if file.suffix == ".csv":
@@ -74,7 +70,7 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
             return [f"{name} has {log[name].shape[1]} columns, those of {policy} are {width}"]
     observation = log["observation"]
     quantities: list[torch.Tensor] = []
-    for name, scale in _SCALES.items():
+    for name, scale in _MEASURED.items():
         width = robot.num_joints if name.startswith("joint") else 3
         zeros = torch.tensor(robot.default_joint_pos if name == "joint_pos" else 0.0)
         quantities.append((log.get(name, torch.zeros(len(observation), width)) - zeros) * torch.tensor(scale))
