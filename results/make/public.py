@@ -31,7 +31,6 @@ from qd.workers.crosser import Crosser
 from results.make.common import COUNTS, read_alike, runs_of_today
 from results.make.pictures import FOLDER as PICTURES
 from results.make.publishers import LEAGUE, PUBLISHERS, read_mjcf, walk
-from results.make.speed import time_crossings
 from sim.controllers.imports import import_controller
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
@@ -53,7 +52,7 @@ OBSTACLES = (f"step_up={_RISES}", f"stairs_up={_RISES}", "payload", "delay")
 """Of which the size is measured that half of the robots cross."""
 RATES = {"terrains": 100, "episodes": 10}
 """Of a set, and of a terrain."""
-FILM_SIZE, FILM_BYTES = (320, 180), 300_000
+FILM_SIZE, FILM_BYTES = (400, 225), 300_000
 """Width and height [pixels], and the largest file."""
 
 
@@ -170,7 +169,6 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         "faults_witness": None,
         "causes": {cause: len(rows) for cause, rows in ranking.by_cause().items()},
         "minimal": worst,
-        "episodes_per_s_32768": None,
     }
 
 
@@ -195,7 +193,6 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--only", nargs="+", choices=CONTROLLERS, default=list(CONTROLLERS))
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--speed", action="store_true", help="time many robots too, alone on the device")
     parser.add_argument("--films", action="store_true", help="films of searches that are there, and nothing else")
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
     parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
@@ -219,10 +216,6 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     for name in args.only:
         if not (numbers := read_numbers(files[name])):
             numbers = measure(name, args.folder.resolve(), runs, compute, seed=args.seed, small=args.small)
-        if args.speed:
-            robot, space = get_robot(str(runs / name / "robot.toml")), at_height(SUPER_GAUSSIAN, numbers["height"]).name
-            timed = time_crossings(robot, 32768, compute.device, args.seed, space=space, each=4)
-            numbers["episodes_per_s_32768"] = timed["episodes_per_s"]
         write_atomically(files[name], to_json(origin | {"numbers": numbers}))
         rows = {name: row for name, file in files.items() if (row := read_numbers(file))}
         write_atomically(out, to_json(origin | {"controllers": rows}))
