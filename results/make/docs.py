@@ -405,9 +405,22 @@ def league() -> str:
         "delay": half("delay"),
         "failing families": at_heights("search", "failing_families"),
         "commonest cause": list_causes(1),
-        "licence": lambda row: row.get("licence", NONE),
     }
     return table(read("results/public.json").get("controllers", {}), columns)
+
+
+def drives() -> str:
+    """What stops ANYmal C with gains and with an actuator network, and which of both crosses it with which drive."""
+    labels, drives = {"pd": "gains", "net": "network"}, read("results/anymal/drive.json").get("drives", {})
+    crossed = {
+        f"crossed with the {labels[drive]} by the controller of the {labels[name]}": shown(
+            "crossed", drive, name, "terrains"
+        )
+        for drive, name in product(labels, repeat=2)
+    }
+    rows = {f"search with the {labels[drive]}": {**row["archive"], **row} for drive, row in drives.items()}
+    columns = counts("elites", "corrected_elites", "failing", "confirmed")
+    return table(rows, {**columns, **crossed}, upright=True)
 
 
 def films() -> str:
@@ -501,7 +514,7 @@ TABLES: dict[str, Callable[..., str]] = {
     make.__name__: make
     for make in (
         *(archives, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement),
-        *(minimal, packs, league, films, speed, kernels, noise, conditions, condition_examples, differences),
+        *(minimal, packs, league, films, drives, speed, kernels, noise, conditions, condition_examples, differences),
     )
 }
 
