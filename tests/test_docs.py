@@ -75,13 +75,6 @@ def test_the_controllers_of_the_page_act(tmp_path, anymal):
     # Its actor returns joint positions, which stand behind angular velocity, gravity and command in its row.
     adapted = runpy.run_path(str(tmp_path / "row.py"))["adapt"](lambda parts: parts[:, 9:21], anymal)(row)
     torch.testing.assert_close(adapted, row[:, 12:24], rtol=1e-5, atol=1e-6)
-    smooth, actor = (
-        load_policy(f"{code}{anymal.policy_file}", anymal, "cpu") for code in (f"{tmp_path}/smooth.py:Smooth@", "")
-    )
-    with torch.inference_mode():
-        for begins, share in (([True] * 5, [0.5] * 5), ([True] + [False] * 4, [0.5] + [0.75] * 4)):
-            smooth.reset(torch.tensor(begins))
-            torch.testing.assert_close(smooth(row), torch.tensor(share)[:, None] * actor(row))
 
 
 def test_the_description_of_the_page_is_read(tmp_path, anymal):
