@@ -176,15 +176,11 @@ class ExportCommand(ControllerFlags, EliteFlags):
         making = self.making
         robot = get_robot(self.robot or "anymal")
         run = find_run(robot, self.run, published="never")
-        make_pack(
-            find_search(run, robot=self.robot, policy=self.policy, space=self.space),
-            parse_controllers(making.controllers, robot) if making.controllers else {},
-            compute=Compute.resolve(making.device, making.workers, making.num_envs),
-            size=making.size,
-            episodes=making.episodes,
-            seed=making.seed,
-            out=self.out,
-        )
+        search = find_search(run, robot=self.robot, policy=self.policy, space=self.space)
+        controllers = parse_controllers(making.controllers, robot) if making.controllers else {}
+        compute = Compute.resolve(making.device, making.workers, making.num_envs)
+        sizes: Any = {"size": making.size, "episodes": making.episodes, "seed": making.seed}
+        make_pack(search, controllers, compute=compute, out=self.out, **sizes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +238,6 @@ class ViewCommand(RobotFlag, EliteFlags):
     host: str = "127.0.0.1"
     """Address to serve it at. 127.0.0.1 is reached from this machine alone, 0.0.0.0 from the network: there is no
     password."""
-
     cache: Path = Path("runs") / "recordings"
     """Where recordings are stored."""
 

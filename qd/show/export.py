@@ -21,10 +21,6 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.bank import make_terrains
 from sim.terrains.maps.terrain_files import FORMATS, ExportedTerrain, check_formats, write_terrain
 
-INDEX_FILE = "index.json"
-"""List of the exported terrains."""
-README_FILE = "README.md"
-"""How other programs take the files."""
 _FOLDER = "terrains"
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 
@@ -34,7 +30,7 @@ def export_elites(
 ) -> list[Path]:
     """Writes elites of an archive or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
 
-    ``options`` are ``formats`` and ``overwrite``, as :func:`export_pack` has them.
+    ``options`` may have ``formats``, all by default, and ``overwrite``.
     """
     archive = opened_run.archive
     space = opened_run.space
@@ -65,15 +61,9 @@ def export_elites(
 
 
 def export_pack(
-    named: str,
-    elite: str = "all",
-    robot: str | None = None,
-    *,
-    formats: Sequence[str] = tuple(FORMATS),
-    out: Path | None = None,
-    overwrite: bool = False,
+    named: str, elite: str, robot: str | None = None, *, out: Path | None = None, **options: Any
 ) -> list[Path]:
-    """Writes terrains of a pack, by their index, as files that other programs read."""
+    """Writes terrains of a pack, by their index; ``options`` are those of :func:`export_elites`."""
     folder = find_pack(named)
     pack = read_pack(folder)
     pack_robot = resolve_robot(pack.content, robot, folder / PACK_FILE, kind="pack")
@@ -88,7 +78,7 @@ def export_pack(
         ExportedTerrain(name=name, heights=pack.heights[row], genes=pack.genes[row], timestep=pack_robot.physics_dt)
         for name, row in rows.items()
     )
-    return _export(about, terrains, origin, out, formats=formats, overwrite=overwrite)
+    return _export(about, terrains, origin, out, **options)
 
 
 def _export(
@@ -103,12 +93,13 @@ def _export(
     """Writes terrains with what is known of them by their names, an index and how to use them."""
     formats = list(dict.fromkeys(formats))
     check_formats(formats)
-    shared = (INDEX_FILE, README_FILE)
-    stored = sorted(file.name for file in folder.glob("*") if file.name in shared or file.stem in about)
+    index_file = folder / "index.json"
+    readme_file = folder / "README.md"
+    stored = sorted(file.name for file in folder.glob("*") if file in (index_file, readme_file) or file.stem in about)
     if stored and not overwrite:
         names = ", ".join(stored[:3]) + ", ..." * (len(stored) > 3)
         raise ValueError(f"{folder} holds an export already: {names}: give --overwrite to replace it, or another --out")
-    prepare_output(folder / INDEX_FILE)
+    prepare_output(index_file)
     origin = {**origin, **provenance("cpu", 0)}
     del origin["seed"]  # nothing is drawn
     files = []
@@ -117,11 +108,11 @@ def _export(
             files += write_terrain(folder, terrain, formats=formats, about=about[terrain.name] | origin)
             bar.move_to(done)
     readme = _TEMPLATES.get_template("export.md").render(stem=next(iter(about)))
-    write_atomically(folder / README_FILE, f"{readme}\n".encode())
+    write_atomically(readme_file, f"{readme}\n".encode())
     index = [{**facts, "files": name} for name, facts in about.items()]
-    write_atomically(folder / INDEX_FILE, to_json({"formats": formats, "elites": index, **origin}))
+    write_atomically(index_file, to_json({"formats": formats, "elites": index, **origin}))
     print(f"{len(about)} terrain{'s' * (len(about) != 1)} as {', '.join(formats)}: {folder}")
-    return [*files, folder / README_FILE, folder / INDEX_FILE]
+    return [*files, readme_file, index_file]
 
 
 def export_controller(policy: str | None, robot: RobotCfg, out: Path, *, overwrite: bool = False) -> None:

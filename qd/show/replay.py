@@ -29,8 +29,6 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.maps.heightmap import as_terrain, fitted, read_heightmap
 from sim.terrains.terrains import Terrains
 
-USER_FOLDER = RUNS / "terrains"
-"""Where files about a user's terrains go."""
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _MAX_NAME = 120  # characters of a map's path; with robot, controller and ending a file may have 255
 
@@ -119,18 +117,10 @@ def source_from_run(
 
 
 def source_from_map(
-    file: Path,
-    robot: RobotCfg,
-    *,
-    size_m: tuple[float, float] | None = None,
-    scale_m: float | None = None,
-    offset_m: float | None = None,
-    policy: str | None = None,
-    seed: int = 0,
-    **crossing: Any,
+    file: Path, robot: RobotCfg, *, policy: str | None = None, replicas: int = 20, seed: int = 0, **sizes: Any
 ) -> ReplaySource:
-    """A user's height map, as :func:`sim.terrains.maps.heightmap.read_heightmap` takes it."""
-    heightmap = read_heightmap(file, size_m=size_m, scale_m=scale_m, offset_m=offset_m)
+    """A user's height map; ``sizes`` are those that :func:`sim.terrains.maps.heightmap.read_heightmap` takes."""
+    heightmap = read_heightmap(file, **sizes)
     print(f"{file}: {fitted(heightmap)}", flush=True)
     heights = as_terrain(heightmap)
     controller = policy or str(robot.policy_file)
@@ -151,11 +141,11 @@ def source_from_map(
         scales = (1.0,) * len(robot.penalties)
     seeds = episode_seeds(seed, 0, 1, stream=Stream.RECORDED_USER_TERRAIN)
     terrain = Terrains(heights=heights[None], seeds=seeds, ground=heightmap.ground)
-    request = CrossingRequest(label=file.name, terrain=terrain, policy=controller, seed=seed, **crossing)
+    request = CrossingRequest(label=file.name, terrain=terrain, policy=controller, replicas=replicas, seed=seed)
     return ReplaySource(
         robot=robot,
         fitness=FitnessCfg(penalties=robot.penalties, scales=scales),
-        folder=USER_FOLDER,
+        folder=RUNS / "terrains",
         terrains=[ReplayTerrain(request=request, stem=f"{stem}-{label}", about=about)],
         by=label.removeprefix(robot.name)[1:],
         inputs=(file, file.with_suffix(".json")),

@@ -4,9 +4,8 @@ import base64
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -27,26 +26,23 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.spaces.base import TerrainSpace
 
-_FIGURE_QUALITY = 80  # of WebP
 TILE = (96, 48)
 """Width and height of a small picture [pixels]."""
 _LOT = 50  # terrains that are drawn together
 _EVERY = 2  # every other node is enough for a small picture
-_SHEET_QUALITY = 70  # of WebP
 _SIZE = (960, 600)  # of a close picture [pixels], which a page shows at half of that
 _DISTANCE = 3.0  # of the camera [m]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Table:
+class Table(NamedTuple):
     """Rows of text; the first cell names the row."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
 
 
-def encode_picture(picture: Image.Image | Figure, quality: int = _FIGURE_QUALITY) -> str:
-    """Source of an ``img`` element."""
+def encode_picture(picture: Image.Image | Figure, quality: int = 80) -> str:
+    """Source of an ``img`` element, a WebP."""
     content = io.BytesIO()
     image = as_image(picture) if isinstance(picture, Figure) else picture
     image.save(content, "WEBP", quality=quality)
@@ -106,7 +102,7 @@ def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any
         for k, heights in enumerate(grids):
             pixels = relief(heights, None if grounds is None else grounds[k : k + 1])[::-1]  # y up
             image.paste(Image.fromarray(pixels).resize(TILE, Image.Resampling.BOX), offsets[first + k])
-    return {"source": encode_picture(image, _SHEET_QUALITY), "offsets": offsets}
+    return {"source": encode_picture(image, quality=70), "offsets": offsets}
 
 
 Moment = tuple[Recording, int, float]

@@ -86,12 +86,8 @@ def write_report(
         cases = cross_cases(opened_run, ranking, controller, heads, others, recordings, pictured=not missing)
         lost = [number for number in (*heads, *others) if number not in cases]
         missing += [f"All crossings of elite {number} were invalid this time." for number in lost]
-    content |= {"policy": policy, "compared": compared, "missing": missing}
-    content |= {
-        name: [cases[number] for number in numbers if number in cases]
-        for name, numbers in {"heads": heads, "others": others}.items()
-    }
-    return page.publish_page(out, "search.html", **content)
+    shown = {"heads": [*filter(None, map(cases.get, heads))], "others": [*filter(None, map(cases.get, others))]}
+    return page.publish_page(out, "search.html", policy=policy, compared=compared, missing=missing, **shown, **content)
 
 
 def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[int]]:
@@ -130,11 +126,10 @@ def cross_cases(
     with Bar("drawing", len(heads) + len(others)) as bar:
         for done, number in enumerate((*heads, *others), 1):
             recording = recorded[number, policy]
-            name = certifiers.get(number)
-            ghost = None if name is None else (name, recorded[number, files[name]])
-            case = _make_case(opened_run, ranking, number, recording, ghost, pictured)
-            if case is not None:
-                cases[number] = case
+            if (recording.outcome[0] != Outcome.INVALID).any():
+                name = certifiers.get(number)
+                ghost = None if name is None else (name, recorded[number, files[name]])
+                cases[number] = case = _make_case(opened_run, ranking, number, recording, ghost, pictured)
                 if number in heads:
                     title = f"{archive.robot}, elite {number} of {len(archive):,}: {case['rate'].count} crossings"
                     case["figure"] = page.encode_picture(draw_crossing(recording, title))
@@ -149,10 +144,8 @@ def _make_case(
     recording: Recording,
     ghost: tuple[str, Recording] | None,
     pictured: bool,
-) -> dict[str, Any] | None:
+) -> dict[str, Any]:
     """What the template takes of an elite; ``source`` is a picture at ``time_s`` [s], empty without pictures."""
-    if (recording.outcome[0] == Outcome.INVALID).all():
-        return None
     moments = page.choose_moments(recording, ghost and ghost[1], opened_run.scales)
     sources = page.render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
@@ -225,10 +218,9 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
 
 def format_mean(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
     """Mean over terrains, with its interval over families where there are enough terrains."""
+    mean = page.percent(float(rates.mean()))
     limits = bootstrap_interval(rates, 0, families=families, bounds=RATES) if len(rates) >= _MIN_TERRAINS else None
-    return page.percent(float(rates.mean())) + (
-        f" ({page.percent(limits[0])} to {page.percent(limits[1])})" if limits else ""
-    )
+    return f"{mean} ({' to '.join(map(page.percent, limits))})" if limits else mean
 
 
 def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
@@ -236,23 +228,21 @@ def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
 
     Each has a name, its failing elites and faults, percent of the longest bar an elite, and the row of its worst elite.
     """
-    groups: list[tuple[str, NDArray[np.int64], int | None]] = [
-        (cause, rows, int(rows[0])) for cause, rows in ranking.by_cause().items()
-    ]
+    groups = ranking.by_cause()
+    tiles = {cause: int(rows[0]) for cause, rows in groups.items()}
     if len(groups) > _MAX_BARS:
-        rest = groups[_MAX_BARS - 1 :]
-        groups = groups[: _MAX_BARS - 1]
-        groups.append((f"{len(rest)} other causes", np.concatenate([rows for _, rows, _ in rest]), None))
-    longest = max((len(rows) for _, rows, _ in groups), default=1)
+        rest = [groups.pop(cause) for cause in [*groups][_MAX_BARS - 1 :]]
+        groups[f"{len(rest)} other causes"] = np.concatenate(rest)
+    longest = max(map(len, groups.values()), default=1)
     return [
         {
             "name": name,
             "failing": len(rows),
             "faults": int((ranking.verdict[rows] == _FAULT).sum()),
             "share": 100.0 / longest,
-            "tile": tile,
+            "tile": tiles.get(name),
         }
-        for name, rows, tile in groups
+        for name, rows in groups.items()
     ]
 
 

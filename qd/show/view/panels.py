@@ -123,18 +123,18 @@ class Address(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, ren
         texts = {name: value if isinstance(value, str) else f"{value:.9g}" for name, value in values.items()}
         return urlencode(texts, safe=",", quote_via=quote)
 
-
-def read_address(query: str) -> tuple[Address, list[str]]:
-    """The address of a page behind its question mark, and a sentence for each value that is no number."""
-    values = dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True))
-    refused = []
-    for name, value in [*values.items()]:
-        try:
-            msgspec.convert({name: value}, Address, strict=False)
-        except msgspec.ValidationError:
-            refused.append(f"{name}={value} in the address is no number that makes sense: it is left out.")
-            del values[name]
-    return msgspec.convert(values, Address, strict=False), refused
+    @classmethod
+    def parse(cls, query: str) -> tuple["Address", list[str]]:
+        """The address of a page behind its question mark, and a sentence for each value that is no number."""
+        values = dict(parse_qsl(query.removeprefix("?"), keep_blank_values=True))
+        refused = []
+        for name, value in [*values.items()]:
+            try:
+                msgspec.convert({name: value}, cls, strict=False)
+            except msgspec.ValidationError:
+                refused.append(f"{name}={value} in the address is no number that makes sense: it is left out.")
+                del values[name]
+        return msgspec.convert(values, cls, strict=False), refused
 
 
 class ArchivePanel:

@@ -40,12 +40,12 @@ class RecordingWorker:
 
         self._cancelled = cancelled
         self._make_crosser = RecordingCrosser
-        self._crosser: RecordingCrosser | None = None
+        self._crosser: Any = None  # of the first task's robot
 
     def put(self, task: Any, robot: Any) -> None:
         """Accept a task of a robot."""
         self._task = task
-        self._robot = robot
+        self._crosser = self._crosser or self._make_crosser(robot, "cpu")
 
     def take(self, progress: Callable[[float], None]) -> Any:
         """The recording or the film's file; an error of the task; None if it was cancelled."""
@@ -59,7 +59,6 @@ class RecordingWorker:
             if isinstance(self._task, partial):
                 self._task(progress=report)
                 return self._task.keywords["out"]
-            self._crosser = self._crosser or self._make_crosser(self._robot, "cpu")
             return self._crosser([self._task], report)[0]
         except CancelledError:
             return None

@@ -222,7 +222,7 @@ class Scene:
             camera = self._client.camera
             camera.position = camera.position + (base - before)  # what it looks at goes with it
 
-    def show_ghost(self, crossing: Crossing, frame: int, label: str = "") -> None:
+    def show_ghost(self, crossing: Crossing, frame: int, label: str) -> None:
         """Put a second, translucent robot where it is at a frame of its own crossing, with a label over it."""
         with self._client.atomic():
             for k, shape in enumerate(() if self._has_ghost else self._shapes):
@@ -232,7 +232,6 @@ class Scene:
             self.ghost.visible = True
             _move_bodies(self.ghost_bodies, crossing, frame)
             self._ghost_name.text = label
-            self._ghost_name.visible = bool(label)
             self._ghost_name.position = tuple(crossing.positions[frame, 0] + [0.0, 0.0, 0.35])
 
     def _add_mesh(self, name: str, mesh: trimesh.Trimesh, color: Color, **look: Any) -> Any:

@@ -16,16 +16,7 @@ from qd.search.directory import output_folder
 from qd.show.crossed import find_ghost_episode, find_typical_episode
 from qd.show.film import film
 from qd.show.recordings import CrossingRequest, Recordings
-from qd.show.view.panels import (
-    TERRAINS,
-    Address,
-    ArchivePanel,
-    Clock,
-    CrossingPanel,
-    PlayerBar,
-    Selection,
-    read_address,
-)
+from qd.show.view.panels import TERRAINS, Address, ArchivePanel, Clock, CrossingPanel, PlayerBar, Selection
 from qd.show.view.playing import Crossing, group_episodes, trace_crossing, trace_paths
 from qd.show.view.recorder import Recorder, TaskProgress
 from qd.show.view.scene import BodyShape, Scene, View, compute_first_view, compute_overview
@@ -155,7 +146,7 @@ class Tab:
     def go_to(self, query: str) -> None:
         """Show what an address asks for; one without a time opens just before the robot fails, and plays."""
         show = self.show
-        address, refused = read_address(query)
+        address, refused = Address.parse(query)
         for text in refused:
             self.refuse(text)
         elite = self.selection.picked if address.elite is None else address.elite
@@ -166,8 +157,7 @@ class Tab:
             if name is not None and name not in choices:
                 self.refuse(f"There is no controller '{name}' here: there are {', '.join(show.controllers) or 'none'}.")
         if address.controller in show.controllers:
-            self.controller = address.controller
-            self.panel.controller.value = address.controller
+            self.controller = self.panel.controller.value = address.controller
         if address.ghost in self.ghost_choices:
             self.ghost_choice = address.ghost
         is_minimal = address.terrain == TERRAINS[1]
@@ -376,13 +366,11 @@ class Tab:
         elite = self.selection.picked
         name = show.ranking.name(elite)
         minimal_genes = show.minimal_genes(elite)
-        genes = minimal_genes if self.minimal and minimal_genes is not None else self.show.archive.genes[elite]
+        genes = minimal_genes if self.minimal and minimal_genes is not None else show.archive.genes[elite]
         conditions = show.space.condition_text(genes)
-        facts = filter(
-            None, (f"elite {elite} of {len(self.show.archive):,}", VERDICTS[show.ranking.verdict[elite]], conditions)
-        )
+        facts = (f"elite {elite} of {len(show.archive):,}", VERDICTS[show.ranking.verdict[elite]], conditions)
         self.bar.show({"title": name + " · minimal terrain" * self.minimal, "elite": elite})
-        text = f"<b>{escape(name)}</b><br>{' · '.join(facts)}"
+        text = f"<b>{escape(name)}</b><br>{' · '.join(filter(None, facts))}"
         self.panel.head.content = f'<div style="padding:0 0.6em 0.4em">{text}</div>'
         self.panel.terrain.visible = minimal_genes is not None
         self.panel.terrain.value = TERRAINS[self.minimal]

@@ -12,7 +12,7 @@ import pytest
 
 from qd.search.archive import write_archive
 from qd.show.view.app import check_port
-from qd.show.view.panels import Address, Clock, Selection, read_address
+from qd.show.view.panels import Address, Clock, Selection
 from qd.show.view.viewed import ViewedRun, count_endings, open_viewed_run, render_rates
 from tests.builders import fresh_values, judged_archive, small_archive
 from tests.qd.recordings import recording_of
@@ -114,12 +114,12 @@ def test_time_goes_by_at_its_speed_and_begins_again():
     ],
 )
 def test_what_an_address_says_comes_back(address):
-    assert read_address(address.query()) == (address, [])
-    assert read_address("?" + address.query()) == (address, [])
+    assert Address.parse(address.query()) == (address, [])
+    assert Address.parse("?" + address.query()) == (address, [])
 
 
 def test_what_means_nothing_is_said_and_left_out():
-    address, refused = read_address("elite=twelve&episode=1.5&t=nan&more=1")
+    address, refused = Address.parse("elite=twelve&episode=1.5&t=nan&more=1")
     assert address == Address()
     assert [text.split("=")[0] for text in refused] == ["elite", "episode", "t"]
     assert Address(elite=7, time_s=1.25, follow=True).query() == "elite=7&t=1.25&follow=1"
