@@ -145,10 +145,9 @@ def draw_crossing(recording: Recording, title: str) -> Figure:
     image = draw_heights(top, recording.heights[0], ground)
     figure.colorbar(image, ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
     handles = [*_draw_paths(top, recording), *(Line2D([], [], **look) for look in (START, GOAL))]
-    if ground is not None and (ground.friction < 1.0).any():
-        handles.append(Patch(color=SLIPPERY, alpha=0.5, label="slippery"))
-    if ground is not None and ground.time_constant_s.any():
-        handles.append(Patch(color=SOFT, alpha=0.5, label="soft"))
+    if ground is not None:
+        patches = {"slippery": (SLIPPERY, ground.friction < 1.0), "soft": (SOFT, ground.time_constant_s > 0.0)}
+        handles += [Patch(color=color, alpha=0.5, label=label) for label, (color, at) in patches.items() if at.any()]
     row = recording.heights[0, recording.heights.shape[1] // 2]  # along the straight line from start to goal
     x = np.linspace(0.0, LENGTH, len(row))
     profile.fill_between(x, row, min(float(row.min()), 0.0) - 0.1, color="0.75")

@@ -35,8 +35,7 @@ from sim.terrains.maps.picture import LENGTH, height_colors
 
 FPS = 25
 """Pictures a second of a film."""
-SIZE = (1280, 720)
-"""Width and height of a film [pixels]."""
+_SIZE = (1280, 720)  # of a film [pixels]
 GIF_FPS = 12.5
 """Pictures a second of a GIF; each lasts whole hundredths of a second."""
 GIF_SIZE = (480, 270)
@@ -227,7 +226,7 @@ def film(
         episode = find_typical_episode(recording, scales)
     shot = Shot(recording=recording, episode=episode, title=make_title(recording, by), beside=beside)
     gif = out.suffix == ".gif"
-    size = GIF_SIZE if gif else SIZE
+    size = GIF_SIZE if gif else _SIZE
     times = shot.times(GIF_FPS if gif else FPS, whole=whole)
     pictures = render_pictures(shot, robot, times, size, shadows=shadows, progress=progress)
     if gif:

@@ -25,7 +25,6 @@ from sim.robots.robot import RobotCfg, robot_identity
 from sim.terrains.spaces.registry import get_space, space_key
 from sim.terrains.terrains import Terrains
 
-FOLDER = RUNS / "recordings"
 _LOT = 32  # terrains crossed side by side on a GPU
 
 
@@ -100,7 +99,7 @@ class RecordingCrosser:
 class Recordings:
     """The stored recordings of a robot."""
 
-    def __init__(self, robot: RobotCfg, *, device: str = "cpu", folder: Path = FOLDER) -> None:
+    def __init__(self, robot: RobotCfg, *, device: str = "cpu", folder: Path = RUNS / "recordings") -> None:
         on_gpu = device.startswith("cuda")  # its last bits differ from a CPU's
         self._settings = [robot_identity(robot), robot.penalties, on_gpu, code_fingerprint(("kernels", "sim"))]
         self._cache = Cache(folder)

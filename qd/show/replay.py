@@ -179,11 +179,8 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
     valid = outcome != Outcome.INVALID
     count = int(valid.sum())
     outcomes = {o.name.lower(): int((outcome == o).sum()) for o in Outcome if 0 < o < Outcome.TILT}
-    hits = {
-        "success": count - outcomes["base_collision"],
-        "goal": outcomes["goal"],
-        "fallen": int(recording.fallen[0, valid].sum()),
-    }
+    fallen = int(recording.fallen[0, valid].sum())
+    hits = {"success": count - outcomes["base_collision"], "goal": outcomes["goal"], "fallen": fallen}
     sums = recording.result().penalties[0, valid]
     return {
         "episodes": recording.num_episodes,
@@ -209,22 +206,21 @@ def describe(source: ReplaySource, terrain: ReplayTerrain, recording: Recording)
     cells = Cells(len(source.fitness.penalties)) if run is None else run.archive.cells
     now = evaluate_rollout(recording.result(), cells, source.fitness)
     columns: list[tuple[str, Evaluation, int]] = []
-    about: dict[str, Any] = {"run": None}
+    about: dict[str, Any] = {}
     if run is not None and elite is not None:
-        about = _describe_elite(run, elite, now)
+        archive = run.archive
+        number = elite.number
         whole = "whole, " if elite.minimal else ""
-        stored = {"as found": run.archive, "fresh": run.archive.fresh}
-        columns = [(f"{whole}{label}", values, elite.number) for label, values in stored.items() if values is not None]
+        stored = {"as found": archive, "fresh": archive.fresh}
+        columns = [(f"{whole}{label}", values, number) for label, values in stored.items() if values is not None]
+        about["parts"] = elite.minimal["words"] if elite.minimal else run.space.describe(elite.genes).splitlines()
+        about["same_cell"] = now.valid[0] and cells.are_neighbours(archive.cell[number : number + 1], now.cell)[0]
+        about["verdicts"] = describe_judgement(archive, number)
     columns.append(("now", now, 0))
     reasons = invalid_reasons(recording.result())
     units = [f"{PENALTIES[name].label} [{PENALTIES[name].unit}]" for name in source.fitness.penalties]
-    lines = _TEMPLATES.get_template("replay.txt").render(
-        units=", ".join(units),
-        invalid=sum(reasons.values()),
-        reasons=format_reasons(reasons),
-        **about,
-        controller=source.by,
-    )
+    about |= {"units": ", ".join(units), "invalid": sum(reasons.values()), "reasons": format_reasons(reasons)}
+    lines = _TEMPLATES.get_template("replay.txt").render(run=run, elite=elite, controller=source.by, **about)
     indent: Any = {"initial_indent": "  ", "subsequent_indent": "    ", "break_on_hyphens": False}
     text = [textwrap.fill(line, 80, **indent) for line in lines.splitlines()]
     return "\n".join([make_title(recording, source.by), *_format_numbers(columns, source.fitness), *text])
@@ -252,21 +248,3 @@ def _format_numbers(columns: Sequence[tuple[str, Evaluation, int]], fitness: Fit
     label_width = max(map(len, rows))
     width = max(len(text) for row in rows.values() for text in row)
     return [f"{label:{label_width}}" + "".join(f"  {text:>{width}}" for text in row) for label, row in rows.items()]
-
-
-def _describe_elite(run: OpenedRun, terrain: EliteTerrain, now: Evaluation) -> dict[str, Any]:
-    """What the template takes of an elite."""
-    archive = run.archive
-    number = terrain.number
-    minimal = terrain.minimal
-    same_cell = bool(now.valid[0]) and archive.cells.are_neighbours(archive.cell[number : number + 1], now.cell)[0]
-    return {
-        "run": run.path,
-        "archive": archive,
-        "elite": number,
-        "terrain": minimal["words"] if minimal else run.space.describe(terrain.genes).splitlines(),
-        "minimal": run.minima.describe(number) if minimal and run.minima else "",
-        "verdict": (minimal or {}).get("verdict", "not judged"),
-        "same_cell": same_cell,
-        "verdicts": describe_judgement(archive, number),
-    }

@@ -1,6 +1,5 @@
 """One page about a run: what is known of it, and robots that cross its worst terrains for the page."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +81,8 @@ def write_report(
             open_context(8, 8).free()
         except ValueError as error:
             missing.append(f"Close pictures are left out: {error}.")
-        recordings = Recordings(opened_run.robot, device=choose_device(device))
-        cases = cross_cases(opened_run, ranking, controller, heads, others, recordings, pictured=not missing)
+        device = choose_device(device)
+        cases = cross_cases(opened_run, ranking, controller, heads, others, device, pictured=not missing)
         lost = [number for number in (*heads, *others) if number not in cases]
         missing += [f"All crossings of elite {number} were invalid this time." for number in lost]
     shown = {"heads": [*filter(None, map(cases.get, heads))], "others": [*filter(None, map(cases.get, others))]}
@@ -102,26 +101,19 @@ def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[i
 
 
 def cross_cases(
-    opened_run: OpenedRun,
-    ranking: Ranking,
-    policy: str,
-    heads: Sequence[int],
-    others: Sequence[int],
-    recordings: Recordings,
-    *,
-    pictured: bool,
+    run: OpenedRun, ranking: Ranking, policy: str, heads: list[int], others: list[int], device: str, *, pictured: bool
 ) -> dict[int, dict[str, Any]]:
     """Lets a controller cross elites and takes their pictures, by number; one without a valid episode is left out.
 
     ``heads`` are crossed by their best certifier too, if they have one; ``others`` are shown in short.
     """
-    archive = opened_run.archive
-    files = opened_run.certifiers()
-    certifiers = {number: name for number in heads if (name := opened_run.certifier(number)) is not None}
+    archive = run.archive
+    files = run.certifiers()
+    certifiers = {number: name for number in heads if (name := run.certifier(number)) is not None}
     crossings = [(number, policy) for number in (*heads, *others)]
     crossings += [(number, files[name]) for number, name in certifiers.items()]
     requests = [request_elite(archive, number, policy=controller) for number, controller in crossings]
-    recorded = dict(zip(crossings, recordings.record(requests), strict=True))
+    recorded = dict(zip(crossings, Recordings(run.robot, device=device).record(requests), strict=True))
     cases = {}
     with Bar("drawing", len(heads) + len(others)) as bar:
         for done, number in enumerate((*heads, *others), 1):
@@ -129,7 +121,7 @@ def cross_cases(
             if (recording.outcome[0] != Outcome.INVALID).any():
                 name = certifiers.get(number)
                 ghost = None if name is None else (name, recorded[number, files[name]])
-                cases[number] = case = _make_case(opened_run, ranking, number, recording, ghost, pictured)
+                cases[number] = case = _make_case(run, ranking, number, recording, ghost, pictured)
                 if number in heads:
                     title = f"{archive.robot}, elite {number} of {len(archive):,}: {case['rate'].count} crossings"
                     case["figure"] = page.encode_picture(draw_crossing(recording, title))

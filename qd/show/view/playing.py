@@ -69,9 +69,10 @@ def trace_crossing(
     arrows = np.where(is_shown, _FORCE_LENGTH * newtons, 0.0)
     shapes = [skeleton.model.geom(name) for name in recording.foot_names]
     bodies = [foot.bodyid[0] - 1 for foot in shapes]
-    offsets = [_rotation(quaternions[:, body]).apply(foot.pos) for body, foot in zip(bodies, shapes, strict=True)]
+    turns = [Rotation.from_quat(np.roll(quaternions[:, body], -1, axis=-1)) for body in bodies]
+    offsets = [turn.apply(foot.pos) for turn, foot in zip(turns, shapes, strict=True)]
     feet = positions[:, bodies] + np.stack(offsets, axis=1)
-    yaw = _rotation(qpos[:, 3:7]).as_euler("ZYX")[:, :1]  # commands are in its frame
+    yaw = Rotation.from_quat(np.roll(qpos[:, 3:7], -1, axis=-1)).as_euler("ZYX")[:, :1]  # commands are in its frame
     command = recording.command[0, replica, :frames].astype(np.float64) * [1.0, 1.0, 0.0]
     begin = qpos[:, :3] + [0.0, 0.0, _COMMAND_HEIGHT]
     sums = recording.penalties[0, replica, :frames].astype(np.float64)
@@ -128,11 +129,6 @@ def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]
     replicas = recording.outcome.shape[1]
     commonest_first = sorted(groups.items(), key=lambda group: -len(group[1]))
     return [(f"{len(members)} of {replicas}: {label}", members) for label, members in commonest_first]
-
-
-def _rotation(quaternions: NDArray[np.floating]) -> Rotation:
-    """Rotations by unit quaternions w x y z."""
-    return Rotation.from_quat(np.roll(quaternions, -1, axis=-1))
 
 
 def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, ...]]]:

@@ -6,19 +6,17 @@ The process takes seconds to load the simulation, so it starts before the page, 
 import threading
 from collections.abc import Callable, Hashable
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.synchronize import Event
-from typing import Any
+from typing import Any, NamedTuple
 
 from qd.workers.process import EvaluatorError, WorkerProcess
 
 _PREPARING = "the simulation is built; the very first one compiles its kernels, up to some minutes"
 
 
-@dataclass(frozen=True, kw_only=True)
-class TaskProgress:
+class TaskProgress(NamedTuple):
     """How far a task is."""
 
     task: Any

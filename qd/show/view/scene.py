@@ -5,8 +5,7 @@ Colours of vertices are in linear light, as glTF and the browser want them.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -44,8 +43,7 @@ _LINE_DARKNESS = 0.84
 _SEGMENTS = 20  # round an arrow
 
 
-@dataclass(frozen=True, kw_only=True)
-class BodyShape:
+class BodyShape(NamedTuple):
     """Shapes of one body that show the same touch, in its frame."""
 
     body: int

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import viser
 
@@ -35,8 +35,7 @@ NO_GHOST = "none"
 """Ghosts to choose beside the controllers: the certifier of the elite, if it is at hand, and none."""
 
 
-@dataclass(frozen=True)
-class Shared:
+class Shared(NamedTuple):
     """What all tabs share."""
 
     show: ViewedRun
@@ -401,9 +400,8 @@ class Tab:
     def _show_ghost(self, text: str = "is recorded") -> None:
         """Show the ghost in the same episode or in one that arrives; the longer of both crossings sets the duration."""
         replica = self.replica or 0
-        ghost_replica = replica
-        if self.ghost.recording is not None:
-            ghost_replica = find_ghost_episode(self.ghost.recording, replica, self.show.scales)
+        recording = self.ghost.recording
+        ghost_replica = replica if recording is None else find_ghost_episode(recording, replica, self.show.scales)
         self.ghost.show_episode(ghost_replica)
         crossing = self.robot.crossing
         ghost = self.ghost.crossing
