@@ -25,8 +25,7 @@ from sim.trials import MEASURES, Variant, walk_variants
 _FIRST_S, _SECOND_S = 3.6, 4.5  # time that robots walk in the two rounds [s]
 _KEPT = 16  # changes in the second round
 _EPISODES = {"cuda": (4, 16), "cpu": (1, 4)}  # of each change in the two rounds
-_UNLIKELY = re.compile(r"command x \(| and \w+ x|signs of (.|...) of")
-"""Changes that need more evidence: of two things at once, and of a sensor's axes that no turn of it makes."""
+_UNLIKELY = re.compile(r"command x \(| and \w+ x|signs of (.|...) of")  # of two things, and axes that no turn makes
 _LEAST_GAIN = 0.03  # of the score for which a change is named
 _WEIGHTS = {"roll_pitch_rate": 0.2, "tilt": 2.0, "action_rate": 0.4, "action": 0.05, "power": 0.4}
 """Chosen on errors planted into Go2 (robot_lab), B2, Go1 and ANYmal, on no other robot."""
@@ -51,9 +50,8 @@ def write_out(cfg: ControllerCfg, robot: RobotCfg) -> ControllerCfg:
     for k, width in enumerate(Described(cfg, robot, "controller.toml").widths):
         cfg = _scale_term(cfg, k, np.ones(width))
     scale = _times(cfg.action_scale, np.ones(len(joints)))
-    return replace(
-        cfg, joints=joints, default=cfg.default or _select(robot.default_joint_pos, robot, joints), action_scale=scale
-    )
+    default = cfg.default or _select(robot.default_joint_pos, robot, joints)
+    return replace(cfg, joints=joints, default=default, action_scale=scale)
 
 
 def propose_changes(base: Variant) -> list[Change]:
@@ -230,10 +228,8 @@ def describe_setting(base: Variant, variant: Variant) -> str:
         return "in robot.toml write " + " and ".join(f"{name} = {to_toml(value)}" for name, value in settings.items())
     before = write_out(base.controller, base.robot)
     changed = _differences(before, variant.controller)
-    terms = zip(changed.pop("observation", before.observation), before.observation, strict=True)
-    lines = [
-        f"as term {k} of observation {to_toml(_plain(t))}" for k, (t, former) in enumerate(terms, 1) if t != former
-    ]
+    terms = enumerate(zip(changed.pop("observation", before.observation), before.observation, strict=True), 1)
+    lines = [f"as term {k} of observation {to_toml(_plain(term))}" for k, (term, former) in terms if term != former]
     lines += [f"{name} = {to_toml(value)}" for name, value in _plain(changed).items()]
     return f"in controller.toml write {' and '.join(lines)}"
 

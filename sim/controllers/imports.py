@@ -97,12 +97,9 @@ def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
     is_named = model_file is None or str(model).startswith(MENAGERIE)
     model_setting = str(model) if is_named else os.path.relpath(model_file.resolve(), out.resolve())
     source.set(model_file=Path(model_setting), policy=weights_file.name)
-    texts = {
-        file: "".join(f"{_format_setting(name, source)}\n" for name in names if name in source.settings)
-        for file, names in _SETTINGS_BY_FILE.items()
-    }
-    order = [name for names in _SETTINGS_BY_FILE.values() for name in names]
-    gaps = [name for name in order if source.settings.get(name, "") is None]
+    lines = {name: _format_setting(name, source) for name in source.settings}
+    texts = {file: "".join(lines.get(name, "") for name in names) for file, names in _SETTINGS_BY_FILE.items()}
+    gaps = [name for names in _SETTINGS_BY_FILE.values() for name in names if source.settings.get(name, "") is None]
     if not {*gaps} & {*_SETTINGS_BY_FILE["controller.toml"]}:
         read_controller(out / "controller.toml", texts["controller.toml"])  # or is refused, before anything is written
     out.mkdir(parents=True, exist_ok=True)
@@ -138,8 +135,8 @@ def _format_setting(name: str, source: Source) -> str:
     value: Any = source.settings[name]
     reason = source.reasons[name]
     if value is None:
-        return f"# {name} = ...  # fill in: {reason}"
+        return f"# {name} = ...  # fill in: {reason}\n"
     text = to_toml(value)
     if name == "observation":
         text = "".join(["[\n", *(f"  {to_toml(term)},\n" for term in value), "]"])
-    return f"{name} = {text}{f'  # a guess: {reason}' if reason else ''}"
+    return f"{name} = {text}{f'  # a guess: {reason}' if reason else ''}\n"

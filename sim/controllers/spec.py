@@ -40,9 +40,8 @@ class ControllerSpec:
         return cls(file=str(spec)) if match is None else cls(**match.groupdict())
 
     def __str__(self) -> str:
-        if self.module is None:
-            return str(self.file)
-        return f"{self.module}:{self.name}" + ("" if self.file is None else f"@{self.file}")
+        code = self.module and f"{self.module}:{self.name}"
+        return "@".join(filter(None, (code, self.file)))
 
     @property
     def runs_code(self) -> bool:
@@ -133,8 +132,7 @@ _LIBRARIES = [sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "pur
 _FOLDERS_NOT_OF_USERS = [*map(Path, _LIBRARIES), *(ROOT / room for room in ROOMS)]
 _ADVICE = re.compile(
     r"(?s)Weights only load failed.*(trusted source\.|WeightsUnpickler error: )|\. (Please use `torch|This is an int).*"
-)
-"""Advice of torch about any file that it refuses: to load it as code, or that it is damaged."""
+)  # advice of torch about any file that it refuses: to load it as code, or that it is damaged
 
 
 def in_one_line(error: BaseException) -> str:

@@ -21,18 +21,8 @@ from kernels.state import RobotStep
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
-from sim.mujoco_c.model import (
-    NO_SOFTNESS,
-    Array,
-    Starts,
-    crossing_model,
-    goal_commands,
-    observations,
-    sense_columns,
-    step_penalties,
-    to_mujoco,
-)
-from sim.robots.actuator_net import ActuatorNet
+from sim.mujoco_c.model import NO_SOFTNESS, Starts, crossing_model, goal_commands, observations, step_penalties
+from sim.robots.actuator_net import ActuatorNet, Array
 from sim.robots.compiled import mj, robot_spec
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
@@ -40,10 +30,8 @@ from sim.terrains.bank import TerrainBank, make_terrains
 from sim.terrains.conditions.kinds import nominal_row, split_row
 from sim.terrains.terrains import GroundMaps, Terrains
 
-_WARNINGS = [
-    getattr(mj.mjtWarning, f"mjWARN_{name}")
-    for name in ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
-]
+_WARNING_NAMES = ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
+_WARNINGS = [getattr(mj.mjtWarning, f"mjWARN_{name}") for name in _WARNING_NAMES]
 
 
 @lru_cache(maxsize=8)
@@ -71,7 +59,7 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
         episodes.rng.assign(np.array([int(wp.rand_init(signed, k)) for k in range(count)], dtype=np.uint32))
         where = (wp.ones(count, dtype=int), wp.zeros(count, dtype=int), bank.terrain)  # all robots, on the one terrain
         restart_episodes(*where, make_start_ranges(CrossingCfg(), robot), sensors, step, episodes, Rewards())
-    return to_mujoco(step.joint_q.numpy(), step.joint_qd.numpy(), base_com.astype(np.float32))
+    return Starts.of_newton(step.joint_q.numpy(), step.joint_qd.numpy(), base_com.astype(np.float32))
 
 
 class EpisodeStates:
@@ -103,12 +91,12 @@ class EpisodeStates:
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
         self._motors = None if robot.saturation_effort is None else motors[:, self._joints]
         self._net = robot.actuator_net and ActuatorNet(robot.actuator_net, len(self.data) * model.nu)
-        self._targets = np.tile(robot.default_joint_pos, (len(self.data), 1))
-        self._delayed = deque([self._targets.copy()] * self.delay_steps)
+        self.targets = np.tile(robot.default_joint_pos, (len(self.data), 1))  # [rad], which count after their delay
+        self._delayed = deque([self.targets.copy()] * self.delay_steps)
 
     def step(self, running: NDArray[np.intp]) -> None:
         """One physics step of the numbered episodes."""
-        self._delayed.append(self._targets.copy())
+        self._delayed.append(self.targets.copy())
         controls = self._delayed.popleft()[:, self._joints]
         if self._net is not None:
             controls = self._net.step(controls - self.qpos[:, 7 + self._joints], self.qvel[:, 6 + self._joints])
@@ -132,10 +120,6 @@ class EpisodeStates:
         for condition, values in sorted(self._conditions, key=lambda pair: pair[0].disturbs_last):
             rows = condition.disturb_plain(self, values, rows, running, step)
         return rows
-
-    def hold(self, running: NDArray[np.intp], targets: Array) -> None:
-        """Sets the joint targets [rad] of the numbered episodes; they count after the delay of the robot's drives."""
-        self._targets[running] = targets
 
 
 def _judge(robot: RobotCfg, episodes: EpisodeStates, running: NDArray[np.intp], base: NDArray[np.bool_]) -> Array:
@@ -194,8 +178,9 @@ def cross_in_mujoco_c(
             command[running] = goal_commands(qpos, robot.speed)
             seen = (heights, qpos, qvel, command[running], last_action[running])
             row = observations(*seen, default_joint_pos=default, scan=scan)
-            senses = sense_columns(robot.senses, qpos, episodes.forces[running][:, feet], episodes.torques[running])
-            rows[running] = np.concatenate([row, senses], axis=1)
+            touches = 0.01 * np.linalg.norm(episodes.forces[running][:, feet], axis=2)
+            senses = {"pose": qpos[:, :7], "contacts": touches, "torques": 0.01 * episodes.torques[running]}
+            rows[running] = np.hstack([row, *(senses[name] for name in senses if name in robot.senses)])
             rows = episodes.disturb(rows, running, step)
             observed = rows if remembers else rows[running]
             action = policy(torch.as_tensor(observed, dtype=torch.float32)).numpy().astype(np.float64)
@@ -203,7 +188,7 @@ def cross_in_mujoco_c(
             limited = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
             action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
             last_action[running] = action
-            episodes.hold(running, default + robot.action_scale * action)
+            episodes.targets[running] = default + robot.action_scale * action
         episodes.step(running)
         judged = _judge(robot, episodes, running, base)
         judged[(judged == Outcome.RUNNING) & (step + 1 >= max_steps)] = Outcome.TIME_OUT

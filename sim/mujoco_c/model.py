@@ -6,7 +6,6 @@ quaternion is wxyz, the base's linear velocity that of its origin in the world f
 frame.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any
@@ -23,10 +22,11 @@ from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.heightmap import QUARTER_TURN, Margins, as_hfield
 from sim.terrains.terrains import PATCHES, GroundMaps
 
-_MARGIN_NODES = 70  # 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
+_MARGIN = 70  # nodes, 3.5 m of edge height on each side: a crossing may leave the grid by 2 m
 _MEMORY = 4 << 20  # bytes
 
 Array = NDArray[np.float64]
+Heights = NDArray[np.floating]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,29 +42,25 @@ class Starts:
     def __getitem__(self, rows: slice) -> "Starts":
         return Starts(qpos=self.qpos[rows], qvel=self.qvel[rows])
 
+    @classmethod
+    def of_newton(cls, joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> "Starts":
+        """Newton's joint state as MuJoCo's.
 
-def to_mujoco(joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> Starts:
-    """Newton's joint state as MuJoCo's: quaternion wxyz, velocity of the origin, angular velocity in the base frame.
-
-    Newton's has shapes (num, 7 + num_joints), quaternion xyzw, and (num, 6 + num_joints), velocity of the base's mass
-    centre, which is at ``base_com`` in its frame [m], and angular velocity, world frame.
-    """
-    qpos = joint_q.astype(np.float64)
-    qvel = joint_qd.astype(np.float64)
-    qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
-    for k, quaternion in enumerate(qpos[:, 3:7]):
-        to_world = rotation_matrix(quaternion)
-        qvel[k, :3] -= np.cross(qvel[k, 3:6], to_world @ base_com)
-        qvel[k, 3:6] = to_world.T @ qvel[k, 3:6]
-    return Starts(qpos=qpos, qvel=qvel)
+        Newton's has shapes (num, 7 + num_joints), quaternion xyzw, and (num, 6 + num_joints), velocity of the base's
+        mass centre, which is at ``base_com`` in its frame [m], and angular velocity, world frame.
+        """
+        qpos = joint_q.astype(np.float64)
+        qvel = joint_qd.astype(np.float64)
+        qpos[:, 3:7] = joint_q[:, [6, 3, 4, 5]]
+        for k, quaternion in enumerate(qpos[:, 3:7]):
+            to_world = rotation_matrix(quaternion)
+            qvel[k, :3] -= np.cross(qvel[k, 3:6], to_world @ base_com)
+            qvel[k, 3:6] = to_world.T @ qvel[k, 3:6]
+        return cls(qpos=qpos, qvel=qvel)
 
 
 def crossing_model(
-    robot: RobotCfg,
-    heights: NDArray[np.floating],
-    *,
-    time_constant_s: float | None = None,
-    ground: GroundMaps | None = None,
+    robot: RobotCfg, heights: Heights, *, time_constant_s: float | None = None, ground: GroundMaps | None = None
 ) -> Any:
     """The robot's file on MuJoCo's heightfield, with a sensor of the net contact force on each geom with a role.
 
@@ -116,16 +112,15 @@ _DEPTH = 2.0  # of a level patch [m]
 
 
 def _add_field(
-    spec: Any, heights: NDArray[np.floating], name: str, low: tuple[float, float] = (0.0, 0.0),
-    margin: int | Margins = _MARGIN_NODES,
-) -> None:  # fmt: skip
+    spec: Any, heights: Heights, name: str, low: tuple[float, float] = (0.0, 0.0), margin: int | Margins = _MARGIN
+) -> None:
     """Adds a heightfield whose first node stands at ``low`` [m]."""
     field = as_hfield(heights, margin=margin)
     rows, columns = field.data.shape
     spec.add_hfield(name=name, nrow=rows, ncol=columns, size=field.size, userdata=field.data.ravel())
     x, y, z = field.position
-    _add_geom(spec, name, (x + low[0], y + low[1], z), type=mj.mjtGeom.mjGEOM_HFIELD, hfieldname=name,
-              quat=QUARTER_TURN)  # fmt: skip
+    looks = {"type": mj.mjtGeom.mjGEOM_HFIELD, "hfieldname": name, "quat": QUARTER_TURN}
+    _add_geom(spec, name, (x + low[0], y + low[1], z), **looks)
 
 
 def _add_geom(spec: Any, name: str, position: tuple[float, float, float], **looks: Any) -> None:
@@ -137,11 +132,8 @@ def _add_geom(spec: Any, name: str, position: tuple[float, float, float], **look
     )  # fmt: skip
 
 
-def _add_patches(spec: Any, heights: NDArray[np.floating], ground: GroundMaps) -> tuple[Array, Array]:
-    """Adds a geom a patch, a box where it is level and else a heightfield; columns in which nothing changes are one.
-
-    Returns friction and time constant of each.
-    """
+def _add_patches(spec: Any, heights: Heights, ground: GroundMaps) -> tuple[Array, Array]:
+    """Adds boxes where patches are level, else heightfields; returns friction and time constant of each geom."""
     maps = np.stack([ground.friction[0], ground.time_constant_s[0]], axis=-1).astype(np.float64)
     changes = 1 + np.flatnonzero((maps[:, 1:] != maps[:, :-1]).any(axis=(0, 2)))
     rows, cols = pairwise(range(PATCHES[0] + 1)), pairwise([0, *changes.tolist(), PATCHES[1]])
@@ -151,9 +143,7 @@ def _add_patches(spec: Any, heights: NDArray[np.floating], ground: GroundMaps) -
         # Nodes of the patch along y and x, and those that continue the edge, before and behind.
         axes = tuple(zip((row, col), PATCHES, heights.shape, strict=True))
         (y0, y1), (x0, x1) = ([end * (nodes - 1) // count for end in span] for span, count, nodes in axes)
-        margin_y, margin_x = (
-            (_MARGIN_NODES * (span[0] == 0), _MARGIN_NODES * (span[1] == count)) for span, count, _ in axes
-        )
+        margin_y, margin_x = ((_MARGIN * (span[0] == 0), _MARGIN * (span[1] == count)) for span, count, _ in axes)
         patch = heights[y0 : y1 + 1, x0 : x1 + 1]
         values.append(maps[row[0], col[0]])
         if np.ptp(patch) > 0.0:
@@ -192,7 +182,7 @@ def _lay_ground(model: Any, robot: RobotCfg, friction: Array, time_constant: Arr
     model.geom_priority[geoms] = 1
 
 
-def surface_heights(heights: NDArray[np.floating], x: Array, y: Array) -> Array:
+def surface_heights(heights: Heights, x: Array, y: Array) -> Array:
     """Height [m] of the triangulated grid at world-local points.
 
     Each cell is cut from its (low x, high y) to its (high x, low y) corner. Heights [m] have shape (nrow, ncol); beyond
@@ -242,7 +232,7 @@ def goal_commands(qpos: Array, speed: float) -> Array:
 
 
 def observations(
-    heights: NDArray[np.floating], qpos: Array, qvel: Array, command: Array, last_action: Array, *,
+    heights: Heights, qpos: Array, qvel: Array, command: Array, last_action: Array, *,
     default_joint_pos: Array, scan: NDArray[np.floating],
 ) -> Array:  # fmt: skip
     """Observation rows, shape (num, observation_size); order and scales as the controllers of the field expect them.
@@ -270,12 +260,6 @@ def observations(
     )
 
 
-def sense_columns(senses: Sequence[str], qpos: Array, forces: Array, torques: Array) -> Array:
-    """Columns after the scan, of states, forces on the feet [N] (num, num_feet, 3) and torques of the joints [N m]."""
-    columns = {"pose": qpos[:, :7], "contacts": 0.01 * np.linalg.norm(forces, axis=2), "torques": 0.01 * torques}
-    return np.concatenate([qpos[:, :0], *(columns[name] for name in columns if name in senses)], axis=1)
-
-
 def step_penalties(
     qpos: Array, qvel: Array, command: Array, forces: Array, *, feet: NDArray[np.bool_], force_limit: float
 ) -> Array:
@@ -284,8 +268,6 @@ def step_penalties(
     States and commands are those of :func:`observations`; contact forces on each geom with a role, world frame [N],
     have shape (num, num_geoms, 3). ``feet``, shape (num_geoms,), may be touched; up to the limit [N] it costs nothing.
     """
-    velocity = _base_velocity(qpos, qvel)
-    step = PlainStep(
-        velocity=velocity, ang_vel=qvel[:, 3:6], command=command, forces=forces, feet=feet, force_limit=force_limit
-    )
+    base = {"velocity": _base_velocity(qpos, qvel), "ang_vel": qvel[:, 3:6], "command": command}
+    step = PlainStep(**base, forces=forces, feet=feet, force_limit=force_limit)
     return np.stack([penalty.plain(step).astype(float) for penalty in PENALTIES.values()], axis=1)

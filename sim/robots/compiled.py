@@ -42,8 +42,7 @@ _ZERO_ATTRIBUTES = {
     "joint": ("ref",),
     "geom": ("margin", "gap", "adhesion", "surfacevel"),
     "actuator": ("armature", "damping", "delay"),
-}
-"""Attributes of elements that must be 0."""
+}  # attributes of elements that must be 0
 _NEWTON_SOLVERS = {
     "<equality> (connect|weld)": "SolverKamino, closed loops",
     "only joint of its body": "SolverMuJoCo, D6 joints",

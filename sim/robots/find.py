@@ -13,7 +13,7 @@ from sim.files.settings import PositiveFloat
 from sim.robots.robot import ROBOTS, RobotCfg, check_robot_identity
 
 
-def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
+def get_robot(spec: str | RobotCfg | None) -> RobotCfg:
     """Settings of a robot that the command line names; :func:`resolve_robot` is for what a file names.
 
     It names a shipped robot, or the file of another: a robot.toml, or Python, which is run and must set ``ROBOT``. None
@@ -32,9 +32,7 @@ def get_robot(spec: "str | RobotCfg | None") -> RobotCfg:
     raise ValueError(f"unknown robot '{spec}': expected {known}, a robot.toml or a Python file (docs/robots.md)")
 
 
-def resolve_robot(
-    record: Mapping[str, Any], given: "str | RobotCfg | None", file: Path, *, kind: str = "run"
-) -> RobotCfg:
+def resolve_robot(record: Mapping[str, Any], given: str | RobotCfg | None, file: Path, kind: str = "run") -> RobotCfg:
     """The robot that a file names, for example a run's, if it has not changed since.
 
     A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a

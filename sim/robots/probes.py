@@ -4,7 +4,7 @@ A mesh is covered by balls that touch its convex hull from inside.
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -95,14 +95,13 @@ def _cover(triangles: _Array, planes: _Array, inradius: float, tolerance: float)
     return np.array(centres), np.array(chosen_radii)
 
 
-def _rows(centres: _Array, radii: _Array, corners: _Array) -> list[Strip]:
+def _rows(centres: _Array, radii: _Array, corners: _Array) -> Iterator[Strip]:
     """Balls in rows of one radius along the longest side: contacts are made of a row's ends and its deepest ball."""
     middle = corners.mean(axis=0)
     _, _, axes = np.linalg.svd(corners - middle, full_matrices=False)
     along, across = ((centres - middle) @ axis for axis in axes[:2])
     side = np.sign(across) if np.ptp((corners - middle) @ axes[1]) > _WIDE else np.zeros(len(centres))
     side[side == 0.0] = 1.0
-    strips = []
     for radius, lane in itertools.product(np.unique(radii)[::-1], np.unique(side)):
         chosen = np.flatnonzero((radii == radius) & (side == lane))
         if len(chosen):
@@ -111,21 +110,16 @@ def _rows(centres: _Array, radii: _Array, corners: _Array) -> list[Strip]:
             length = float(line @ line) or 1.0
             share = np.clip((row - row[0]) @ line / length, 0.0, 1.0)
             spread = float(np.linalg.norm(row - row[0] - share[:, None] * line, axis=1).max())
-            strips.append(Strip(centres=row, radius=float(radius), spread=spread))
-    return strips
+            yield Strip(centres=row, radius=float(radius), spread=spread)
 
 
-def hull_probes(vertices: _Array) -> tuple[list[Strip], float]:
-    """Probes of the convex hull of vertices [m], shape (num_vertices, 3), and their tolerance [m].
+@lru_cache(maxsize=64)
+def hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
+    """Probes of the convex hull of vertices [m], float64 of shape (num_vertices, 3), and their tolerance [m].
 
     Rows are of one radius, in order along the mesh's longest side, and not straight. No probe sticks out; every point
     of the hull's surface lies at most the tolerance outside of the nearest one.
     """
-    return _hull_probes(np.asarray(vertices, dtype=np.float64).tobytes())
-
-
-@lru_cache(maxsize=64)
-def _hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
     try:
         hull = ConvexHull(np.frombuffer(vertices).reshape(-1, 3))
     except QhullError:
@@ -140,18 +134,17 @@ def _hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
     tolerance = min(_MESH_TOLERANCE, _SMALL_MESH_SHARE * float(np.ptp(corners, axis=0).max()))
     while (balls := _cover(triangles, planes, inradius, tolerance)) is None:
         tolerance *= _GROWTH
-    return _rows(*balls, corners), tolerance
+    return [*_rows(*balls, corners)], tolerance
 
 
-MAX_SAG = 0.005
-"""Deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]."""
+_MAX_SAG = 0.005  # deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]
 CAPSULE_SAG = 0.0005
 """Deepest that it may sink between those of a capsule [m]: limbs stand, slide and hang on edges with them."""
 _MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose edges the probes round off [m]
 _MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
 
 
-def _max_spacing(radius: float, max_sag: float = MAX_SAG) -> float:
+def _max_spacing(radius: float, max_sag: float = _MAX_SAG) -> float:
     """Largest distance of neighbouring probes between which a sharp ridge sinks at most so deep [m]."""
     sag = min(max_sag, radius)  # of two spheres at distance s it is r - sqrt(r^2 - s^2 / 4)
     return 2.0 * float(np.sqrt(2.0 * radius * sag - sag * sag))
@@ -171,7 +164,7 @@ def capsule_strips(radius: float, half_height: float) -> list[Strip]:
     return [Strip(centres=_along_z(0.0, 0.0, _line(-half_height, half_height, spacing)), radius=radius)]
 
 
-def box_strips(*half: float) -> list[Strip]:
+def box_strips(*half: float) -> Iterator[Strip]:
     """Parallel strips under the whole surface of a box, along its longest side (z of a cube).
 
     Edges and corners are rounded by at most 2 cm; faces are exact at every probe.
@@ -182,37 +175,32 @@ def box_strips(*half: float) -> list[Strip]:
     order = [*np.argsort(half, kind="stable")]
     thin, middle, along = (_line(-half[k] + radius, half[k] - radius, spacing) for k in order)
     back = np.argsort(order)
-    strips = []
     for px, py in itertools.product(thin, middle):
         is_rim = px in thin[[0, -1]] or py in middle[[0, -1]]
         # Inside the cross-section only the two end faces have a surface.
         for row in [along] if is_rim else [along[:1], along[-1:]]:
-            strips.append(Strip(centres=_along_z(float(px), float(py), row)[:, back], radius=radius))
-    return strips
+            yield Strip(centres=_along_z(float(px), float(py), row)[:, back], radius=radius)
 
 
-def cylinder_strips(radius: float, half_height: float) -> list[Strip]:
+def cylinder_strips(radius: float, half_height: float) -> Iterator[Strip]:
     """Strips along the axis (z) round the mantle, and rings of single probes on the two end faces."""
     probe = min(_MAX_EDGE_RADIUS, radius, half_height)
     spacing = _max_spacing(probe)
     z = _line(-half_height + probe, half_height - probe, spacing)
-    strips = []
     for ring, ring_radius in enumerate(_line(0.0, radius - probe, spacing)[::-1]):
         count = max(1, int(np.ceil(2.0 * np.pi * ring_radius / spacing)))
         for angle in np.arange(count) * 2.0 * np.pi / count:
             x, y = (float(ring_radius * f(angle)) for f in (np.cos, np.sin))
             for row in [z] if ring == 0 else [z[:1], z[-1:]]:
-                strips.append(Strip(centres=_along_z(x, y, row), radius=probe))
-    return strips
+                yield Strip(centres=_along_z(x, y, row), radius=probe)
 
 
-_PRIMITIVES: dict[newton.GeoType, tuple[int, Callable[..., list[Strip]]]] = {
+_PRIMITIVES: dict[newton.GeoType, tuple[int, Callable[..., Iterable[Strip]]]] = {
     newton.GeoType.SPHERE: (1, lambda radius: [Strip(centres=np.zeros((1, 3)), radius=radius)]),
     newton.GeoType.CAPSULE: (2, capsule_strips),
     newton.GeoType.CYLINDER: (2, cylinder_strips),
     newton.GeoType.BOX: (3, box_strips),
-}
-"""How many sizes a primitive has, and its strips."""
+}  # how many sizes a primitive has, and its strips
 
 
 def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None) -> list[Strip]:
@@ -230,9 +218,9 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     if not longest <= _MAX_SIDE:
         raise ValueError(f"it is {longest:g} m long, more than {_MAX_SIDE:g} m: give lengths in m, a mesh its scale")
     if make_strips is not None:
-        return make_strips(*map(float, sizes))
+        return [*make_strips(*map(float, sizes))]
     if is_mesh:
-        return hull_probes(vertices)[0]
+        return hull_probes(vertices.tobytes())[0]
     kind = newton.GeoType(shape_type).name
     raise ValueError(f"it must be a SPHERE, CAPSULE, BOX, CYLINDER or MESH, got {kind}: replace it in the robot's file")
 

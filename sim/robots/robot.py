@@ -22,7 +22,6 @@ PENALTY_DEFINITION = "squared"
 SENSES = {"pose": ("heading", "yaw", "quat", "base_pos"), "contacts": ("contacts",), "torques": ("torques",)}
 """What a robot may sense beside the usual row, and terms of a controller's observation that need it."""
 _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning", "label", "paper")
-_SHOWN_DIGITS = 12  # of a hash in a message
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,7 +240,7 @@ def check_robot_digest(record: Mapping[str, Any], robot: RobotCfg, file: Path, r
     """Refuses a file's record of the robot before it changed; ``remedy`` is what else helps."""
     expected, now = record.get("robot_sha256"), robot_digest(robot)
     if expected != now:
-        hashes = f"expected SHA-256 {str(expected)[:_SHOWN_DIGITS]}, got {now[:_SHOWN_DIGITS]} of {robot.spec}"
+        hashes = f"expected SHA-256 {str(expected)[:12]}, got {now[:12]} of {robot.spec}"
         problem = f"as it was before its settings, model or meshes changed ({hashes})"
         raise ValueError(f"{file} is of robot '{robot.name}' {problem}: put that back, or {remedy}")
 

@@ -204,10 +204,8 @@ def _joint_rows(robot: RobotCfg, sim: Simulation) -> Iterator[Sequence[str]]:
         span = f"{low:.2f} to {high:.2f}" if model.jnt_limited[1 + k] else "free"
         effort = f"{drives.effort[k]:g}" if drives.effort[k] < _NO_EFFORT_LIMIT else "free"
         limits = [f"{limit:g}" for limit in motors[driven.index(1 + k)]] if 1 + k in driven else ["-"] * len(motors.T)
-        gains = (
-            (f"{drives.stiffness[k]:g}", f"{0.0 + drives.damping[k]:g}") if robot.actuator_net is None else ("net",) * 2
-        )
-        gains = *gains, effort if 1 + k in driven else "follows"
+        gains = ["net"] * 2 if robot.actuator_net else [f"{drives.stiffness[k]:g}", f"{0.0 + drives.damping[k]:g}"]
+        gains.append(effort if 1 + k in driven else "follows")
         yield name, f"{angle:.3f}", span, *gains, f"{armature[k]:.3g}", f"{damping[k]:g}", f"{friction[k]:g}", *limits
 
 

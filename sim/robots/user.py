@@ -127,8 +127,7 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     free = [name for name in bottoms if not any(name in names for names in roles.values())]
     roles.setdefault("base_geoms", [name for name in free if body[name] == 1])
     roles.setdefault("foot_geoms", [name for name in free if name in low and body[name] in last_bodies])
-    with_role = {*roles["base_geoms"], *roles["foot_geoms"]}
-    roles.setdefault("limb_geoms", [name for name in free if name not in with_role])
+    roles.setdefault("limb_geoms", [name for name in free if name not in roles["base_geoms"] + roles["foot_geoms"]])
     data = mj.MjData(model)
     data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *pose]
     mj.mj_kinematics(model, data)

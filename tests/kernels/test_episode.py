@@ -19,7 +19,7 @@ from kernels.queue import clear_rows, make_queue, make_ready, restart_episodes, 
 from kernels.rewards import Rewards, make_rewards
 from kernels.state import RobotStep
 from sim.crossing import CrossingCfg, make_start_ranges, make_task
-from sim.mujoco_c.model import goal_commands, to_mujoco
+from sim.mujoco_c.model import Starts, goal_commands
 from sim.robots.find import get_robot
 from tests.kernels import oracle
 from tests.kernels.states import filled, make_terrain, random_states, rough, upright
@@ -176,7 +176,7 @@ def commands(q, outcome=0):
 
 def test_commands_lead_to_the_goal():
     q, qd = random_states(300, 3)
-    expected = goal_commands(to_mujoco(q, qd, np.zeros(3)).qpos, 0.75)
+    expected = goal_commands(Starts.of_newton(q, qd, np.zeros(3)).qpos, 0.75)
     np.testing.assert_allclose(commands(q), expected, atol=2e-5)
     # At (2, 4) facing the goal: 0.75 m/s straight ahead. At (14, 0), facing along x, the goal lies 90 degrees left:
     # 0.75 m/s to the left, yaw rate 0.5 * pi / 2 = 0.785398. Ended: nothing.

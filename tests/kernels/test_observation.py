@@ -7,7 +7,7 @@ import warp as wp
 from kernels.coordinates import Delay, SolverState, from_solver, poses_from_solver, to_solver
 from kernels.observation import Sensors, apply_action, write_observation
 from kernels.state import RobotStep
-from sim.mujoco_c.model import observations, to_mujoco
+from sim.mujoco_c.model import Starts, observations
 from tests.kernels.states import filled, make_terrain, random_states, rough, upright
 
 BASE_COM = (-0.02, 0.01, 0.03)
@@ -39,7 +39,7 @@ def test_parity_with_the_oracle(num_envs, num_joints, num_scan):
     terrain_of_env = rng.integers(0, 2, num_envs)
     got = observe(states, command, action, terrain_of_env, grids, scan)
     default = np.float64(np.float32(np.linspace(-0.5, 0.5, num_joints)))
-    plain = to_mujoco(*states, np.array(BASE_COM))
+    plain = Starts.of_newton(*states, np.array(BASE_COM))
     for env in range(num_envs):
         one = (array[env : env + 1] for array in (plain.qpos, plain.qvel, command, action))
         grid = np.float64(grids[terrain_of_env[env]])
@@ -96,7 +96,7 @@ def written(solver):
 
 def test_coordinates_and_velocities_are_those_of_mujoco(solver, written):
     q, qd, _ = written
-    expected = to_mujoco(q, qd, np.float64(BASE_COM))
+    expected = Starts.of_newton(q, qd, np.float64(BASE_COM))
     order = np.argsort(COLUMNS)
     np.testing.assert_array_equal(solver.qpos.numpy()[:, :7], np.float32(expected.qpos[:, :7]))
     np.testing.assert_array_equal(solver.qpos.numpy()[:, 7:], q[:, 7:][:, order])

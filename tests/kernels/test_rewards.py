@@ -20,7 +20,7 @@ from kernels.training import (
     seed_restarts,
 )
 from sim.crossing import CrossingCfg, make_task
-from sim.mujoco_c.model import step_penalties, to_mujoco
+from sim.mujoco_c.model import Starts, step_penalties
 from sim.robots.find import get_robot
 from sim.robots.training import RewardCfg
 from tests.kernels.states import filled, random_states, upright
@@ -214,7 +214,7 @@ def random_forces(num_envs, num_geoms, seed=0):
 def test_penalties_equal_the_oracle():
     states, forces = random_states(200, 3), random_forces(200, 5)
     command = np.float32(np.random.default_rng(1).uniform(-1, 1, (200, 3)))
-    plain, feet = to_mujoco(*states, np.array(BASE_COM)), np.array(ROLES) == FOOT
+    plain, feet = Starts.of_newton(*states, np.array(BASE_COM)), np.array(ROLES) == FOOT
     exact = (np.float64(command), np.float64(forces))
     expected = step_penalties(plain.qpos, plain.qvel, *exact, feet=feet, force_limit=FORCE_LIMIT)
     np.testing.assert_allclose(sums_after(states, command, forces), PHYSICS_DT * expected, rtol=1e-5, atol=1e-7)

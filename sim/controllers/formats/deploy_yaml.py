@@ -13,10 +13,7 @@ _STEPS = 4  # physics steps a control step, in the tasks of both
 
 
 def read_deploy_yaml(path: Path, source: Source) -> Path:
-    """Settings of a deploy.yaml, which numbers the joints by the motors of Unitree's SDK; the model names them.
-
-    Returns the exported network.
-    """
+    """Settings of a deploy.yaml, which numbers joints by the motors of Unitree's SDK; returns the exported network."""
     source.file = file = path / "params" / "deploy.yaml" if path.is_dir() else path
     content = read_yaml(file)
     motors = content.pop("joint_ids_map")

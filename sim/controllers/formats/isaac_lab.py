@@ -152,10 +152,8 @@ def read_action(
     if limit is not None:
         source.set(action_clip=limit)
     if term.get("clip") is not None:
-        ranges = [
-            angles or [-np.inf, np.inf] for angles in per_joint(term["clip"], joints, f"{label}.clip", partly=True)
-        ]
-        limits = (np.array(ranges) - np.c_[offset]) / np.c_[scale]
+        clips = per_joint(term["clip"], joints, f"{label}.clip", partly=True)
+        limits = (np.array([angles or [-np.inf, np.inf] for angles in clips]) - np.c_[offset]) / np.c_[scale]
         limits = np.clip(limits, *(-1e9, 1e9) if limit is None else (-limit, limit)).tolist()
         source.set(action_clip=limits, reason="the range of targets as one of actions, which limits last_action, too")
 
@@ -190,11 +188,8 @@ def read_scan(sensor: dict[str, Any], grid: dict[str, Any], centre: Sequence[flo
     turns = sensor.get("ray_alignment", "yaw") == "yaw" and sensor.get("attach_yaw_only", True) in (True, None)
     if "resolution" not in grid or not turns:
         raise ValueError(f"{source.file}: a height scanner must be a grid in the yaw frame, got {grid}")
-    fields: dict[str, Any] = {
-        "order": "x fastest" if grid.get("ordering", "xy") == "xy" else "y fastest",
-        "offset": 0.0,
-    }
-    step = grid["resolution"]
+    step, fastest = grid["resolution"], "x" if grid.get("ordering", "xy") == "xy" else "y"
+    fields: dict[str, Any] = {"order": f"{fastest} fastest", "offset": 0.0}
     for axis, side, mid in zip("xy", grid["size"], centre, strict=False):
         fields[axis] = [round(mid - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
     return fields

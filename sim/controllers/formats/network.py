@@ -146,10 +146,7 @@ class _RecurrentScript(Recurrent):
 
 @torch.no_grad()
 def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: str) -> Any:
-    """The module of a file, for rows of ``width`` columns, with a memory of each robot if it remembers one.
-
-    ``probe`` is a copy of the module on the CPU. The tensors that a call of it changes are the memory.
-    """
+    """The module with a memory of each robot: the tensors that a call of ``probe``, its copy on the CPU, changes."""
     rows = torch.randn((3, 3, width), generator=torch.Generator().manual_seed(0))  # steps, robots
     reset = getattr(probe, "reset", getattr(probe, "reset_memory", None))
     if reset is not None:

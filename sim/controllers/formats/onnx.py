@@ -201,8 +201,7 @@ _LAYERS: dict[str, Callable[..., Any]] = {
     "Gemm": lambda rows, weight, bias, alpha=1.0, beta=1.0, **attributes: torch.addmm(
         bias, rows, weight.T if attributes.get("transB") else weight, alpha=alpha, beta=beta
     ),
-}
-"""Operators of a graph of plain layers. Other attributes are found when the outputs are compared."""
+}  # operators of a graph of plain layers; other attributes are found when the outputs are compared
 
 
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":

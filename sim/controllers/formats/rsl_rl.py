@@ -23,8 +23,7 @@ _KNOWN_NAMES = (
     r"mlp\.\d+\.(weight|bias)|rnn\.rnn\.\w+|obs_normalizer\.(_mean|_var|_std|count)|"
     r"distribution\.(log_)?std_param|(log_)?std|critic.*|memory_c\.rnn\.\w+"
 )
-_ELU_KEYS = {"actor_state_dict", "iter", "trained_on"}
-"""A checkpoint of ours that has these alone has ELU between its layers."""
+_ELU_KEYS = {"actor_state_dict", "iter", "trained_on"}  # a checkpoint of ours that has these alone has ELU
 
 
 class MlpPolicy(nn.Module):

@@ -13,7 +13,7 @@ from sim.controllers.described import read_row
 from sim.controllers.loaders import load_policy
 from sim.crossing import GROUND_FRICTION, SolverCfg, resolved
 from sim.mujoco_c.crossing import EpisodeStates, MujocoC, cross_in_mujoco_c, draw_starts
-from sim.mujoco_c.model import GROUND, crossing_model, surface_heights, to_mujoco
+from sim.mujoco_c.model import GROUND, Starts, crossing_model, surface_heights
 from sim.robots.find import get_robot
 from sim.rollout import Rollout
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -30,7 +30,7 @@ def test_starts_are_those_of_the_rollout(robot):
     rollout = Rollout(robot, robot.policy_file, num_terrains=1, replicas=EPISODES, device="cpu")
     rollout.put(Terrains(genes=SUPER_GAUSSIAN.hard_random(1, 5), seeds=np.array([77], np.uint32)))
     sim = rollout.sim
-    expected = to_mujoco(sim.joint_q.numpy(), sim.joint_qd.numpy(), np.array(sim.base_com))
+    expected = Starts.of_newton(sim.joint_q.numpy(), sim.joint_qd.numpy(), np.array(sim.base_com))
     # Asking for more episodes does not change the first.
     starts = draw_starts(robot, sim.bank.heights.numpy()[0], 77, EPISODES + 4, "cpu")
     np.testing.assert_array_equal(starts.qpos[:EPISODES], expected.qpos)
@@ -150,9 +150,10 @@ def test_a_motor_gives_what_its_speed_leaves_it_in_both(tmp_path, device, kind):
     sim.targets.assign(np.float32(pose))
     sim.physics_step()
     np.testing.assert_allclose(sim.joint_torque.numpy()[:, 6 + joint], TORQUES, atol=1e-4)
-    everyone, starts = np.arange(len(SPEEDS)), to_mujoco(standing(robot, len(SPEEDS), z=5.0), joint_qd, np.zeros(3))
+    everyone = np.arange(len(SPEEDS))
+    starts = Starts.of_newton(standing(robot, len(SPEEDS), z=5.0), joint_qd, np.zeros(3))
     plain = EpisodeStates(robot, crossing_model(robot, FLAT), starts)
-    plain.hold(everyone, pose[:, 7:])
+    plain.targets[:] = pose[:, 7:]
     plain.step(everyone)
     np.testing.assert_allclose([data.qfrc_actuator[6 + joint] for data in plain.data], TORQUES, atol=1e-9)
 
@@ -163,10 +164,10 @@ def test_a_target_counts_after_the_delay_in_both(tmp_path, device):
     pose, everyone = standing(robot, 2, z=5.0), np.arange(2)
     sim = simulate(robot, np.repeat(FLAT[None], 2, axis=0), device)
     put(sim, pose)
-    plain = EpisodeStates(robot, crossing_model(robot, FLAT), to_mujoco(pose, np.zeros((2, 14)), np.zeros(3)))
+    plain = EpisodeStates(robot, crossing_model(robot, FLAT), Starts.of_newton(pose, np.zeros((2, 14)), np.zeros(3)))
     pose[:, 7] += 0.1  # 6 N m
     sim.targets.assign(np.float32(pose))
-    plain.hold(everyone, pose[:, 7:])
+    plain.targets[:] = pose[:, 7:]
     torques = []
     for step in range(5):
         sim.physics_step()

@@ -8,7 +8,7 @@ import torch
 
 from sim.crossing import resolved
 from sim.mujoco_c.crossing import EpisodeStates
-from sim.mujoco_c.model import crossing_model, to_mujoco
+from sim.mujoco_c.model import Starts, crossing_model
 from sim.robots.find import get_robot
 from sim.robots.robot import robot_digest
 from sim.robots.user import PackedRobot, pack_robot
@@ -61,13 +61,14 @@ def test_torques_are_those_of_the_module_in_both(tmp_path, device, kind):
     for step in range(18):
         if step in (0, 9):  # an episode begins
             put(sim, pose)
-            plain = EpisodeStates(robot, crossing_model(robot, FLAT), to_mujoco(pose, np.zeros((2, 14)), np.zeros(3)))
+            starts = Starts.of_newton(pose, np.zeros((2, 14)), np.zeros(3))
+            plain = EpisodeStates(robot, crossing_model(robot, FLAT), starts)
             past, state, due = torch.zeros(4, 16, 2), (torch.zeros(2, 16, 4), torch.zeros(2, 16, 4)), pose[:, 7:]
         now = np.stack([due - plain.qpos[:, 7:], plain.qvel[:, 6:]], axis=-1).reshape(1, 16, 2)
         past = torch.cat([torch.tensor(now, dtype=torch.float32), past[:-1]])
         due = targets[step % 9]
         sim.targets.assign(np.float32(np.hstack([pose[:, :7], due])))
-        plain.hold(np.arange(2), due)
+        plain.targets[:] = due
         sim.physics_step()
         plain.step(np.arange(2))
         if kind == "dense":

@@ -192,7 +192,7 @@ MESHES = {
 @pytest.mark.parametrize("name", MESHES)
 def test_mesh(name):
     vertices, max_tolerance = MESHES[name]
-    strips, tolerance = hull_probes(vertices)
+    strips, tolerance = hull_probes(np.asarray(vertices, dtype=np.float64).tobytes())
     centres, radii = spheres(strips)
     assert tolerance <= max_tolerance * (1 + 1e-6) and len(radii) <= MAX_MESH_PROBES
     assert tolerance == pytest.approx(max_tolerance) or name == "base"
@@ -220,10 +220,10 @@ def test_mesh(name):
 def test_a_mesh_is_scaled_collides_as_its_hull_and_needs_a_volume():
     hollow = SimpleNamespace(vertices=np.vstack([CORNERS, CORNERS / 2]))
     strips = shape_strips(newton.GeoType.MESH, np.array([0.2, 0.1, 0.05]), hollow)
-    expected = hull_probes(CORNERS * [0.2, 0.1, 0.05])[0]
+    expected = hull_probes((CORNERS * [0.2, 0.1, 0.05]).tobytes())[0]
     np.testing.assert_array_equal(spheres(strips)[0], spheres(expected)[0])
     with pytest.raises(ValueError, match="volume"):
-        hull_probes(CORNERS * [1, 1, 0])
+        hull_probes((CORNERS * [1.0, 1.0, 0.0]).tobytes())
 
 
 def test_every_geom_of_a_robot_has_probes_on_its_body(robot):
