@@ -165,8 +165,7 @@ def load_described(cfg: ControllerCfg, weights: Path | None, robot: RobotCfg, de
 
 def _load_encoded(policy: Described, weights: Path, path: Path, load: functools.partial[Any]) -> Encoded:
     """The networks of two files; the policy sees the whole observation, or that of the present step."""
-    encoder = weights_file(path, "encoder")
-    if encoder is None or not os.path.isfile(encoder):
+    if (encoder := weights_file(path, "encoder")) is None or not os.path.isfile(encoder):
         raise ValueError(f"{path}: encoder must name a file of weights beside it, got {policy.cfg.encoder!r}")
     size, history = policy.observation_size, policy.cfg.history
     sizes = {size, sum(policy.widths) if history is not None and history.by == "row" else size}

@@ -44,8 +44,7 @@ class Memory(Enum):
 
 def find_memory(policy: Any) -> Memory:
     """Finds out what a policy remembers."""
-    reset = getattr(policy, "reset", None)
-    if not callable(reset):
+    if not callable(reset := getattr(policy, "reset", None)):
         return Memory.NONE
     try:
         inspect.signature(reset).bind(None)

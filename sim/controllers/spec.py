@@ -1,7 +1,6 @@
 """How a controller is named on a command line: a file, code, or code that adapts a file."""
 
 import hashlib
-import importlib
 import importlib.util
 import re
 import sys

@@ -85,8 +85,7 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
         controller.act(log["action"][step : step + 1] if "action" in log else answers[-1])
     labels = _label_columns(controller)
     names = [label.partition(" ")[0] for label in labels]
-    unknown = [name for name in names if not log.keys() >= {*_NEEDS.get(name, (name,))}]
-    if unknown:
+    if unknown := [name for name in names if not log.keys() >= {*_NEEDS.get(name, (name,))}]:
         print(f"Not compared, since {file.name} lacks what they are made of: {', '.join(dict.fromkeys(unknown))}.")
     seen = torch.where(torch.tensor([name in unknown for name in names]), observation, torch.cat(rebuilt))
     if len(unknown) == len(names) and "action" not in log:

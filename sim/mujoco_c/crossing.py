@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Callable
 from copy import copy
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,12 +33,6 @@ _WARNING_NAMES = ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "
 _WARNINGS = [getattr(mj.mjtWarning, f"mjWARN_{name}") for name in _WARNING_NAMES]
 
 
-@lru_cache(maxsize=8)
-def _base_com(robot: RobotCfg) -> Array:
-    """Mass centre of the base in its frame [m]."""
-    return robot_spec(robot).compile().body_ipos[1].copy()
-
-
 def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int, device: str) -> Starts:
     """The starts that :class:`sim.rollout.Rollout` gives to replicas 0 to ``count - 1`` of a terrain with this seed.
 
@@ -47,7 +40,7 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
     """
     bank = TerrainBank(1, device=device)
     bank.set_heights(heights[None])
-    base_com = _base_com(robot)
+    base_com = robot_spec(robot).compile().body_ipos[1].copy()
     with wp.ScopedDevice(device):
         sensors = make_struct(Sensors, default_joint_pos=wp.array(robot.default_joint_pos, dtype=float))
         widths = {"joint_q": 7, "joint_qd": 6, "action": 0}
@@ -168,8 +161,7 @@ def cross_in_mujoco_c(
     remembers = reset_all(policy, count)  # it must be asked for the same robots every time
     max_steps = round(robot.max_duration_s / robot.physics_dt)
     for step in range(max_steps):
-        running = np.flatnonzero(outcome == Outcome.RUNNING)
-        if len(running) == 0:
+        if len(running := np.flatnonzero(outcome == Outcome.RUNNING)) == 0:
             break
         if step % robot.decimation == 0:
             qpos = episodes.qpos[running]

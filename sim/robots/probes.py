@@ -137,14 +137,15 @@ def hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
     return [*_rows(*balls, corners)], tolerance
 
 
-_MAX_SAG = 0.005  # deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]
+MAX_SAG = 0.005
+"""Deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]."""
 CAPSULE_SAG = 0.0005
 """Deepest that it may sink between those of a capsule [m]: limbs stand, slide and hang on edges with them."""
 _MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose edges the probes round off [m]
 _MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
 
 
-def _max_spacing(radius: float, max_sag: float = _MAX_SAG) -> float:
+def _max_spacing(radius: float, max_sag: float = MAX_SAG) -> float:
     """Largest distance of neighbouring probes between which a sharp ridge sinks at most so deep [m]."""
     sag = min(max_sag, radius)  # of two spheres at distance s it is r - sqrt(r^2 - s^2 / 4)
     return 2.0 * float(np.sqrt(2.0 * radius * sag - sag * sag))

@@ -15,8 +15,7 @@ from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveFloat, 
 from sim.robots.model_files import read_model_files
 from sim.robots.training import LearningCfg, PaperCfg, RewardCfg, TrainingCfg, TuningCfg
 
-ROBOTS_DIR = Path(__file__).parent
-"""Folder of the files of the shipped robots."""
+_ROBOTS_DIR = Path(__file__).parent  # of the files of the shipped robots
 PENALTY_DEFINITION = "squared"
 """How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
 SENSES = {"pose": ("heading", "yaw", "quat", "base_pos"), "contacts": ("contacts",), "torques": ("torques",)}
@@ -173,7 +172,7 @@ class RobotCfg:
     @property
     def home(self) -> Path:
         """Folder of its controller, training record and penalty scales: that of the settings of a user's robot."""
-        return ROBOTS_DIR if self.settings_file is None else self.settings_file.parent
+        return _ROBOTS_DIR if self.settings_file is None else self.settings_file.parent
 
     @property
     def policy_file(self) -> Path:
@@ -247,8 +246,7 @@ def check_robot_digest(record: Mapping[str, Any], robot: RobotCfg, file: Path, r
 
 def check_robot_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path, remedy: str) -> None:
     """Refuses a file's record of the robot before it changed, or of penalties that are defined otherwise."""
-    definition = record.get("penalty_definition")
-    if definition != PENALTY_DEFINITION:
+    if (definition := record.get("penalty_definition")) != PENALTY_DEFINITION:
         raise ValueError(f"{file} is of penalties by {definition} errors, expected {PENALTY_DEFINITION} ones; {remedy}")
     check_robot_digest(record, robot, file, remedy)
 
@@ -262,7 +260,7 @@ ROBOTS = {
     "anymal": RobotCfg(
         name="anymal",
         label="ANYmal C",
-        model_file=ROBOTS_DIR / "anymal.xml",
+        model_file=_ROBOTS_DIR / "anymal.xml",
         base_geoms=("base",),
         foot_geoms=tuple(f"{leg}_FOOT" for leg in _LEGS),
         limb_geoms=tuple(f"{leg}_{part}" for leg in _LEGS for part in ("THIGH", "SHANK")),
@@ -281,7 +279,7 @@ ROBOTS = {
     "cassie": RobotCfg(
         name="cassie",
         label="Cassie",
-        model_file=ROBOTS_DIR / "cassie.xml",
+        model_file=_ROBOTS_DIR / "cassie.xml",
         base_geoms=("pelvis",),
         foot_geoms=tuple(f"{side}_toe" for side in _SIDES),
         limb_geoms=(),

@@ -16,8 +16,7 @@ _SHAPE = mj.mjtGeom
 _SEGMENTS = 20  # round a capsule
 _CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
 
-LOOK_SUFFIX = ".look.xml"
-"""Suffix of an MJCF beside the model file, with shapes to show in place of the model's, by the names of bodies."""
+_LOOK_SUFFIX = ".look.xml"  # of an MJCF beside the model file, with shapes to show in place of the model's
 _BARE, _VISUAL, _HIDDEN = 0, 2, 3  # groups; MuJoCo shows 0 to 2
 _BASE_COLOR = (0.27, 0.29, 0.33, 1.0)
 _LIMB_COLOR = (0.47, 0.50, 0.55, 1.0)
@@ -29,14 +28,14 @@ def shown_spec(robot: RobotCfg) -> Any:
     """An ``MjSpec`` to look at, with the robot's joints in the robot's order behind that of its base.
 
     Shapes have the names that the simulation gives them: in a URDF that of the link, in an MJCF ``<body>_geom_<k>`` if
-    they have none. A body shows its shapes of the file :data:`LOOK_SUFFIX`, else those of the model that touch nothing,
-    else all of them.
+    they have none. A body shows its shapes of a file with the suffix ``.look.xml`` beside the model, else those of the
+    model that touch nothing, else all of them.
     """
     try:
         spec = robot_spec(robot, visuals=True)
     except ValueError:  # for example a visual mesh of too many faces
         spec = robot_spec(robot)
-    look_file = robot.model_file.with_suffix(LOOK_SUFFIX)
+    look_file = robot.model_file.with_suffix(_LOOK_SUFFIX)
     looks = defaultdict[str, list[dict[str, Any]]](list)  # shapes by the name of their body, as add_geom takes them
     if look_file.is_file():
         look: Any = _compiled(lambda: mj.MjModel.from_xml_path(str(look_file)), look_file)

@@ -33,12 +33,10 @@ class _Ports:
 
     def __init__(self, inputs: Sequence[Any], outputs: Sequence[Any], sizes: tuple[int, int] | None) -> None:
         """From onnxruntime's ports; ``sizes`` of observation and action are those of the graph if None."""
-        self.axes: dict[str, int] = {}
-        """Axis of robots of each input."""
+        self.axes: dict[str, int] = {}  # of robots, of each input
         self.is_single = False
         names = [port.name for port in outputs]
-        pairs = {port.name: f"{port.name.removesuffix('_in')}_out" for port in inputs}
-        pairs = {name: output for name, output in pairs.items() if output in names}
+        pairs = {port.name: state for port in inputs if (state := f"{port.name.removesuffix('_in')}_out") in names}
         rest = [port for port in outputs if port.name not in pairs.values()]
         actions = [port for port in rest if "action" in port.name] or rest
         self.columns = {port.name: self._read_shape(port) for port in inputs if port.name not in pairs}

@@ -16,8 +16,7 @@ def read_rl_sar(path: Path, source: Source) -> Path:
     """Settings of a YAML, or of a folder's config.yaml, over base.yaml, which is beside it or two above."""
     source.file = file = path / "config.yaml" if path.is_dir() else path
     bases = [folder / "base.yaml" for folder in file.resolve().parents[:3]]
-    base = next(filter(Path.is_file, bases), None)
-    if base is None:
+    if (base := next(filter(Path.is_file, bases), None)) is None:
         raise ValueError(f"base.yaml of the robot is not there: expected {' or '.join(map(str, bases))}")
     content = next(iter(read_yaml(base).values())) | next(iter(read_yaml(file).values()))
     if content.pop("wheel_indices", None):
@@ -35,8 +34,7 @@ def read_rl_sar(path: Path, source: Source) -> Path:
     if steps not in (list(range(len(steps))), list(range(len(steps)))[::-1]):
         raise ValueError(f"{file}: observations_history must be all steps from 0 on, got {steps}")
     priority = content.pop("observations_history_priority", "time")
-    by = {"time": "row", "term": "term"}.get(priority)
-    if by is None:
+    if (by := {"time": "row", "term": "term"}.get(priority)) is None:
         raise ValueError(f"{file}: observations_history_priority must be time or term, got {priority}")
     if len(steps) > 1:
         history = {"length": len(steps), "newest": "last" if steps[0] else "first", "by": by, "fill": "zeros"}

@@ -119,8 +119,7 @@ def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
         got = ", ".join(map(str, state or content)) if isinstance(content, dict) else type(content).__name__
         must = "'actor_state_dict' with 'mlp.0.weight', or 'model_state_dict' with 'actor.0.weight'"
         raise ValueError(f"policy '{path}' is no rsl_rl checkpoint: expected {must}, got {got}")
-    separate = content.get("obs_norm_state_dict") or {}
-    if not isinstance(separate, dict):
+    if not isinstance(separate := content.get("obs_norm_state_dict") or {}, dict):
         raise ValueError(f"policy '{path}': obs_norm_state_dict must be a table, got {type(separate).__name__}")
     normaliser = {f"obs_normalizer.{key}": value for key, value in separate.items()}
     names |= {key: key for key in normaliser}
