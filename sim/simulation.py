@@ -32,7 +32,7 @@ from sim.robots.robot import ActuatorNetCfg, RobotCfg
 from sim.robots.training import NoiseCfg, TrainingCfg
 from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
-from sim.terrains.conditions.kinds import MAX_LATENCY_S, begin_effects, disturb_effects
+from sim.terrains.conditions.kinds import MAX_LATENCY_S, condition_effects
 
 
 class Simulation:
@@ -297,7 +297,7 @@ class Simulation:
     def begin_conditions(self, begins: Any) -> None:
         """Make robots as the conditions of their terrains say where the int ``begins`` (num_envs,) is not 0."""
         if self.disturbed is not None:
-            begin = make_begin(begin_effects())
+            begin = make_begin(condition_effects("begin"))
             begin(begins, self.terrain_of_env, self.bank.conditions, self._varied, self.disturbed)
 
     def disturb(self, episodes: Episodes, dt: float, observation: Any) -> None:
@@ -305,7 +305,7 @@ class Simulation:
         if self.disturbed is not None:
             values = {"dt": dt, "every": round(self.robot.control_dt / dt)}
             values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
-            make_disturb(disturb_effects())(make_struct(DisturbedStep, self, **values))
+            make_disturb(condition_effects("disturb"))(make_struct(DisturbedStep, self, **values))
 
     def refresh(self) -> None:
         """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""

@@ -10,6 +10,7 @@ import reprlib
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from functools import partialmethod
 from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 
@@ -112,9 +113,7 @@ class _PlainLoader(yaml.SafeLoader):
         construct: Any = self.construct_sequence if isinstance(node, yaml.SequenceNode) else self.construct_mapping
         return construct(node, deep=True)
 
-    def drop_this_tag(self, node: yaml.Node) -> Any:
-        """The value of a node of a kind that TOML does not have."""
-        return self.drop_tag("", node)
+    drop_this_tag = partialmethod(drop_tag, "")  # of a kind that TOML does not have
 
 
 _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _PlainLoader.drop_tag)

@@ -57,12 +57,9 @@ class TerrainBank:
     def set(self, terrains: Terrains, slots: slice = _ALL) -> None:
         """Replace the terrains of some slots; without ground their friction and softness change nothing."""
         replaced, space, ground = self.heights[slots], terrains.space, terrains.ground
-        if (space.ground if terrains.heights is None else ground is not None) and self.ground is None:
+        if terrains.has_ground and self.ground is None:
             raise ValueError("terrains have friction or softness, got a bank without maps: give with_ground=True")
-        conditions = (
-            space.conditions if terrains.heights is None else ground is not None and ground.conditions is not None
-        )
-        if conditions and self.conditions is None:
+        if terrains.has_conditions and self.conditions is None:
             raise ValueError("terrains have conditions, got a bank without: give with_conditions=True")
         genes: Any = None
         if terrains.heights is None:

@@ -4,12 +4,14 @@ One control step is one captured graph: action, physics, end of episodes, reward
 pushes, observation. The host copies actions in and results out, and draws no random number.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from kernels.episode import Outcome, latch_outcomes, make_episodes, note_base_forces
+from kernels.episode import Outcome, Task, latch_outcomes, make_episodes, note_base_forces
+from kernels.launch import make_struct
 from kernels.observation import apply_action
 from kernels.queue import StartRanges
 from kernels.rewards import REWARDS, remember_steps
@@ -22,9 +24,8 @@ from kernels.training import (
     record_steps,
     seed_restarts,
 )
-from sim import crossing
 from sim.controllers.loaders import prepare_torch
-from sim.crossing import CAPACITY_OVERFLOWS
+from sim.crossing import CAPACITY_OVERFLOWS, CrossingCfg, make_start_ranges, make_task
 from sim.robots.robot import RobotCfg
 from sim.simulation import Reward, Simulation
 from sim.terrains.bank import TerrainBank
@@ -70,7 +71,7 @@ class CommandTask:
         levels %= self.tiles.num_levels
         self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
         self._task = _make_task(cfg, robot)
-        self._rules = _make_rules(cfg, robot, self.tiles.num_levels, self.tiles.num_columns)
+        self._rules = _make_rules(cfg, robot, self.tiles)
         self._ranges = _make_start_ranges(cfg, robot)
         self._noise = self.sim.make_noise(cfg.noise)
         self.max_episode_steps: int = self._task.max_steps
@@ -197,51 +198,37 @@ class CommandTask:
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
 
 
-def _fill(struct: Any, **values: Any) -> Any:
-    """Set the fields of a kernel argument; returns it."""
-    for name, value in values.items():
-        setattr(struct, name, value)
-    return struct
-
-
 def _make_task(cfg: TaskCfg, robot: RobotCfg) -> Any:
     """Goal, command and limits of an episode as a kernel argument; its steps are control steps."""
-    task = crossing.make_task(crossing.CrossingCfg(), robot, to_goal=cfg.crosses)
+    goal = CrossingCfg(base_force=cfg.base_force)
     if not cfg.crosses:
-        endless = {"lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
-        _fill(task, yaw_gain=cfg.yaw_gain, max_yaw_rate=cfg.max_yaw_rate, **endless)
+        endless: dict[str, Any] = {"lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
+        goal = replace(goal, yaw_gain=cfg.yaw_gain, max_yaw_rate=cfg.max_yaw_rate, **endless)
+    task = make_task(goal, robot, to_goal=cfg.crosses)
     max_steps = round(cfg.episode_s / robot.control_dt)
     # An overflow is counted, and no reason to end an episode.
-    return _fill(task, max_steps=max_steps, base_force=cfg.base_force, max_gravity_z=cfg.max_gravity_z, overflow_mask=0)
+    return make_struct(Task, task, max_steps=max_steps, max_gravity_z=cfg.max_gravity_z, overflow_mask=0)
 
 
-def _make_rules(cfg: TaskCfg, robot: RobotCfg, num_levels: int, num_columns: int) -> Any:
+def _make_rules(cfg: TaskCfg, robot: RobotCfg, tiles: Tiles) -> Any:
     """Commands, pushes and levels of the task as a kernel argument."""
-    control_dt = robot.control_dt
-    return _fill(
-        Rules(),
+    return make_struct(
+        Rules,
+        cfg,
+        tiles,
         crosses=int(cfg.crosses),
         overflow_mask=CAPACITY_OVERFLOWS,
-        num_levels=num_levels,
-        num_columns=num_columns,
         promotion_distance=0.5 * _TILE_SIDE,
         demotion_time_s=0.5 * cfg.episode_s,
-        command_steps=round(cfg.command_interval_s / control_dt),
-        push_steps=round(cfg.push_interval_s / control_dt),
-        **{name: getattr(cfg, name) for name in ("lin_vel_x", "lin_vel_y", "min_speed", "push_speed")},
+        command_steps=round(cfg.command_interval_s / robot.control_dt),
+        push_steps=round(cfg.push_interval_s / robot.control_dt),
     )
 
 
 def _make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
     if cfg.crosses:
-        return _fill(crossing.make_start_ranges(crossing.CrossingCfg(), robot), ahead=cfg.start_spread)
-    return _fill(
-        StartRanges(),
-        position=_TILE_CENTRE,
-        position_range=cfg.start_position_range,
-        yaw_range=cfg.start_yaw_range,
-        joint_scale_range=cfg.start_joint_range,
-        velocity_range=cfg.start_velocity_range,
-        base_height=robot.default_base_height,
-        footprint=(max(robot.footprint), max(robot.footprint)),  # whatever the heading
-    )
+        return make_struct(StartRanges, make_start_ranges(CrossingCfg(), robot), ahead=cfg.start_spread)
+    names = ("start_position_range", "start_yaw_range", "start_joint_range", "start_velocity_range")
+    start = CrossingCfg(start=_TILE_CENTRE, **{name: getattr(cfg, name) for name in names})
+    half = max(robot.footprint)  # whatever the heading
+    return make_struct(StartRanges, make_start_ranges(start, robot), footprint=(half, half))

@@ -7,7 +7,7 @@ they are registered, are the row of conditions of a terrain.
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import warp as wp
@@ -122,16 +122,11 @@ def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str
     return [texts[name] for name in names]
 
 
-def begin_effects() -> tuple[tuple[Any, int], ...]:
-    """Warp functions that vary robots, each with its first column in a row."""
-    columns = split_row(np.arange(len(condition_genes())))
-    return tuple((condition.begin, int(first)) for condition, (first, *_) in columns if condition.begin)
-
-
-def disturb_effects() -> tuple[tuple[Any, int], ...]:
-    """Warp functions that disturb control steps, in the order in which they do, each with its first column in a row."""
+def condition_effects(stage: Literal["begin", "disturb"]) -> tuple[tuple[Any, int], ...]:
+    """Warp functions of a stage in the order in which they act, each with its first column in a row."""
     columns = sorted(split_row(np.arange(len(condition_genes()))), key=lambda pair: pair[0].disturbs_last)
-    return tuple((condition.disturb, int(first)) for condition, (first, *_) in columns if condition.disturb)
+    effects = ((getattr(condition, stage), int(first)) for condition, (first, *_) in columns)
+    return tuple((function, first) for function, first in effects if function)
 
 
 def round_steps(seconds: float, dt: float) -> int:

@@ -87,9 +87,7 @@ def encode_terrain(terrain: ExportedTerrain, ending: str) -> bytes:
             gray = np.rint((heights - offset) / scale).astype(np.uint16)
             Image.fromarray(np.ascontiguousarray(gray[::-1])).save(buffer, format="PNG", optimize=True)
             return buffer.getvalue()
-        case (
-            "npy"
-        ):  # as the terrain generators of Isaac Lab and legged_gym hold heights: int16 [x, y], in steps of 1 mm
+        case "npy":  # as terrain generators of Isaac Lab and legged_gym hold heights: int16 [x, y], in steps of 1 mm
             steps = np.rint(heights.T / STEP_M)
             if np.abs(steps).max() > np.iinfo(np.int16).max:
                 largest = f"{np.abs(heights).max():g} m: leave npy out of the formats"
