@@ -158,10 +158,7 @@ def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
 
 
 def _draw_terrains(count: int, height: float | None) -> Terrains:
-    """Hard-random terrains with their seeds, drawn row by row: the first ones of more are those of fewer.
-
-    All heights are of one space, so that one simulation crosses them.
-    """
+    """Hard-random terrains of one space, for one simulation; the first ones of more are those of fewer."""
     seeds = np.random.SeedSequence(0).generate_state(count, np.uint32)
     genes = SUPER_GAUSSIAN.hard_random(count, 0)
     return Terrains(genes=genes if height is None else SUPER_GAUSSIAN.scaled(genes, height / MAX_HEIGHT), seeds=seeds)
@@ -188,13 +185,13 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
             if scales["failing_episodes"] >= _ENOUGH:
                 break
             print("{failing_episodes} of {episodes} episodes did not reach the goal.".format(**scales), flush=True)
-    origin = {
+    report = {
         **compute.origin(0),
         **controller_identity(robot, policy),
         "space": at_height(SUPER_GAUSSIAN, height or MAX_HEIGHT).name,
+        "crossing": asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s},
+        **scales,
     }
-    crossing = asdict(CrossingCfg()) | {"speed": robot.speed, "max_duration_s": robot.max_duration_s}
-    report = {**origin, "crossing": crossing, **scales}
     absent = [name for name in robot.penalties if name not in report["scales"]]
     if absent and robot.settings_file is not None and robot.settings_file.suffix == ".toml":
         print(f"{', '.join(absent)} never occurred: its scale is 1.")

@@ -341,9 +341,8 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
             evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
             return 0
         if self.policy is not None:
-            raise ValueError(
-                f"tables are of named controllers: give --policies tuned={self.policy} instead of --policy"
-            )
+            remedy = f"give --policies tuned={self.policy} instead of --policy"
+            raise ValueError(f"tables are of named controllers: {remedy}")
         controllers = parse_controllers(self.policies, robot)
         robot = ensure_ready(robot, next(iter(controllers.values())), compute, skip_level_ground=True)
         cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))

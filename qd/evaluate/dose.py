@@ -148,10 +148,8 @@ def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     doses = {name: dose for name, dose in doses.items() if name in chosen}
     allowed = sorted({name for dose in doses.values() for name in dose.others})
     if wrong := others.keys() - set(allowed):
-        raise ValueError(
-            f"at must name quantities that the elements have beside the one that grows ({', '.join(allowed) or 'none'}"
-            f"), got {', '.join(sorted(wrong))}: leave that out"
-        )
+        rule = f"quantities that the elements have beside the one that grows ({', '.join(allowed) or 'none'})"
+        raise ValueError(f"at must name {rule}, got {', '.join(sorted(wrong))}: leave that out")
     return {name: dose.changed(chosen[name], others) for name, dose in doses.items()}
 
 

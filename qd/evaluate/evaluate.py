@@ -64,12 +64,11 @@ def cross_sets(
     episodes: int,
     *,
     engine: Engine = "search",
-    reward: bool = False,
-    penalties_from_s: float = 0.0,
     cache: Path | None = None,
     note: str = "",
+    **settings: Any,
 ) -> dict[str, dict[str, RolloutResult]]:
-    """Set -> controller -> its crossings, as :meth:`qd.workers.crosser.Crosser.cross` makes them.
+    """Set -> controller -> its crossings, as :meth:`qd.workers.crosser.Crosser.cross` makes them by ``settings``.
 
     Prints the rates of each, with ``note`` behind the name of the set.
     """
@@ -81,16 +80,8 @@ def cross_sets(
         crossings = [*product(controllers.items(), sets.items())]
         for number, ((controller, policy), (name, terrains)) in enumerate(crossings, 1):
             label = f"{controller} on {name}{note}" + (f" ({engine})" if engine != "search" else "")
-            result = crosser.cross(
-                policy,
-                terrains.terrains,
-                replicas=episodes,
-                engine=engine,
-                reward=reward,
-                penalties_from_s=penalties_from_s,
-                label=f"{number} of {len(crossings)}: {label}",
-                room=largest,
-            )
+            about = {"label": f"{number} of {len(crossings)}: {label}", "room": largest, **settings}
+            result = crosser.cross(policy, terrains.terrains, replicas=episodes, engine=engine, **about)
             rates = {key: float(np.nanmean(values)) for key, values in terrain_rates(result).items()}
             print(f"{label}: goal {rates['goal']:.3f}, no base collision {rates['success']:.3f}", flush=True)
             results[name][controller] = result
@@ -185,10 +176,8 @@ def _untrained_elites(archive: Archive, controllers: Mapping[str, str], count: i
     elites = random_elites(COMPARED, archive, count, cfg.seed, trained_on)
     families = 0 if elites.families is None else len(np.unique(elites.families))
     if families < 2:
-        raise ValueError(
-            "archive must have elites of 2 families that no controller was trained on, got "
-            f"{len(elites)} elites of {families} in {cfg.archive}: give another"
-        )
+        rule = "must have elites of 2 families that no controller was trained on"
+        raise ValueError(f"archive {rule}, got {len(elites)} elites of {families} in {cfg.archive}: give another")
     return elites
 
 

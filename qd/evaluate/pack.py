@@ -82,9 +82,8 @@ def find_pack(name: str) -> Path:
     if name in ROBOTS and not (folder / PACK_FILE).is_file():
         folder = ROBOTS[name].pack
     if not (folder / PACK_FILE).is_file():
-        raise FileNotFoundError(
-            f"no pack at {folder}: give its folder, or one of {', '.join(ROBOTS)}; `faultline export --pack` makes one"
-        )
+        remedy = f"give its folder, or one of {', '.join(ROBOTS)}; `faultline export --pack` makes one"
+        raise FileNotFoundError(f"no pack at {folder}: {remedy}")
     return folder
 
 
@@ -284,10 +283,8 @@ def make_pack(
     untrained = [candidate for candidate in candidates if hashes[candidate[0]["elite"]] not in trained_on]
     chosen = [untrained[index] for index in choose_terrains([entry for entry, _ in untrained], size)]
     if not chosen:
-        raise ValueError(
-            f"{search.run} must have faults or near-faults that no controller but a specialist was trained on, "
-            f"got none and {not_passable} that nobody crosses"
-        )
+        rule = "must have faults or near-faults that no controller but a specialist was trained on"
+        raise ValueError(f"{search.run} {rule}, got none and {not_passable} that nobody crosses")
     print(f"{len(chosen)} of {len(untrained)} faults and near-faults; {not_passable} more that nobody crosses.")
     chosen_genes = np.array([genes for _, genes in chosen], np.float32)
     heights = round_heights(make_heights(chosen_genes, search.space))
@@ -326,17 +323,14 @@ def make_pack(
 def _read_judged(search: Search) -> Archive:
     """The archive of a search of heights alone; refuses one that is not judged by all stages that a pack needs."""
     if search.space.ground or search.space.conditions:
-        raise ValueError(
-            f"a pack holds heights alone, got terrains of {search.space.name}, which have ground or conditions of "
-            "their own"
-        )
+        got = f"terrains of {search.space.name}, which have ground or conditions of their own"
+        raise ValueError(f"a pack holds heights alone, got {got}")
     archive = search.read_archive()
     crossed = archive.resolved_outcomes.any(axis=1) & archive.certifier_outcomes.any(axis=(1, 2))
     if archive.fresh is None or (archive.failing & ~crossed).any():
-        raise ValueError(
-            f"{search.run} must have its failing elites crossed with contact resolved and by other controllers, got "
-            f"{(archive.failing & crossed).sum()} of {archive.failing.sum()}: run `faultline judge` on it first"
-        )
+        rule = "must have its failing elites crossed with contact resolved and by other controllers"
+        got = f"{(archive.failing & crossed).sum()} of {archive.failing.sum()}"
+        raise ValueError(f"{search.run} {rule}, got {got}: run `faultline judge` on it first")
     return archive
 
 

@@ -112,10 +112,8 @@ def split_elites(archive: Archive, *, held_out: bool = True) -> EliteSplit:
         none = np.zeros(0, np.int64)
         return EliteSplit(train=_sort_by_genes(archive), validation=none, test=none)
     if len(archive) < MIN_ELITES:
-        raise ValueError(
-            f"an archive to be split into training and test terrains needs at least {MIN_ELITES} elites, got "
-            f"{len(archive)}: let its search go on"
-        )
+        rule = f"an archive to be split into training and test terrains needs at least {MIN_ELITES} elites"
+        raise ValueError(f"{rule}, got {len(archive)}: let its search go on")
     num_train, num_test = _TRAINING_ELITES, paper_terrains(archive.robot)
     if len(archive) < num_train + num_test:
         num_test = round(_HELD_OUT_SHARE * len(archive))
@@ -150,11 +148,9 @@ def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, spa
         shared = len({*hash_elites(independent.genes)} & {*hash_elites(archive.genes)})
         other_space = (independent.space, independent.space_sha256) != (archive.space, archive.space_sha256)
         if other_space or shared or (seed is not None and seed == search_seed(archive_path)):
-            raise ValueError(
-                f"independent must be of space {archive.space} and share neither elites nor the search's seed with "
-                f"{archive_path}, got {path} of {independent.space} and seed {seed} with {shared} elites in both: give "
-                "a search with another seed"
-            )
+            rule = f"be of space {archive.space} and share neither elites nor the search's seed with {archive_path}"
+            got = f"{path} of {independent.space} and seed {seed} with {shared} elites in both"
+            raise ValueError(f"independent must {rule}, got {got}: give a search with another seed")
     return independent
 
 
@@ -292,7 +288,6 @@ def check_untrained(controllers: Mapping[str, str], genes: NDArray[np.float32], 
     marks = hash_elites(genes)
     for name, policy in controllers.items():
         if count := len(read_trained_on(policy).intersection(marks)):
-            raise ValueError(
-                f"{name} must not be tested on what it was trained on, got {count} of the {len(marks)} elites of "
-                f"{elites}: give the archive as it was when it was trained, or another search"
-            )
+            got = f"{count} of the {len(marks)} elites of {elites}"
+            remedy = "give the archive as it was when it was trained, or another search"
+            raise ValueError(f"{name} must not be tested on what it was trained on, got {got}: {remedy}")

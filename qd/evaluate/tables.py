@@ -94,21 +94,10 @@ def make_tables(
     for name, row in performances.items():
         families = sets[name].families
         for key, values in _list_measures(sets[name], row):
-            bounds = measure_bounds(key)
-            means[key][name] = {controller: valid_mean(value) for controller, value in values.items()}
-            intervals[key][name] = {
-                controller: valid_interval(value, seed, families, bounds) for controller, value in values.items()
-            }
-        means["penalties"][name] = {
-            controller: {penalty: valid_mean(value) for penalty, value in measured.penalties.items()}
-            for controller, measured in row.items()
-        }
-        intervals["penalties"][name] = {
-            controller: {
-                penalty: valid_interval(value, seed, families, None) for penalty, value in measured.penalties.items()
-            }
-            for controller, measured in row.items()
-        }
+            means[key][name], intervals[key][name] = _summarise(values, seed, families, measure_bounds(key))
+        penalties = {label: _summarise(measured.penalties, seed, families, None) for label, measured in row.items()}
+        means["penalties"][name] = {label: mean for label, (mean, _) in penalties.items()}
+        intervals["penalties"][name] = {label: interval for label, (_, interval) in penalties.items()}
     return {
         "robot": robot.name,
         "episodes": episodes,
@@ -126,6 +115,12 @@ def make_tables(
             for name, row in performances.items()
         },
     }
+
+
+def _summarise(values: Mapping[str, NDArray[np.float64]], *sample: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Means of values and their intervals over a ``sample`` as :func:`valid_interval` takes it, by name."""
+    means = {name: valid_mean(value) for name, value in values.items()}
+    return means, {name: valid_interval(value, *sample) for name, value in values.items()}
 
 
 def _list_measures(

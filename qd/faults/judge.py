@@ -247,11 +247,9 @@ class Varied(Stage):
         stored = zip(archive.certifiers, archive.certifier_sha256, certificates, strict=True)
         names = [name for name, digest, certifies in stored if certifies.any() and hashes.get(name) != digest]
         if lost := [name for name in names if not (renewed and name in hashes)]:
-            raise ValueError(
-                f"certifiers must be those that certify faults of {judging.search.run}, got none or another file for "
-                f"{', '.join(lost)}: give the files by --certifiers, or other controllers of these names and the "
-                "stages others, varied"
-            )
+            rule = f"certifiers must be those that certify faults of {judging.search.run}"
+            remedy = "give the files by --certifiers, or other controllers of these names and the stages others, varied"
+            raise ValueError(f"{rule}, got none or another file for {', '.join(lost)}: {remedy}")
 
 
 STAGES: dict[str, Stage] = {stage.name: stage for stage in (Fresh(), Resolved(), Others(), Varied())}

@@ -243,12 +243,9 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
         if not all(set(_ENTRY) <= set(entry) for entry in entries):
             raise ValueError(f"expected {', '.join(_ENTRY)} of each")
     except Exception as error:  # a damaged zip archive can fail with anything
-        files = f"{folder / MINIMAL_NUMBERS_FILE} and {MINIMAL_FILE}"
+        rule = f"{file} and {MINIMAL_FILE} must be minimal terrains of the archive beside them"
         what = f"it lacks {error}" if isinstance(error, KeyError) else error
-        raise ValueError(
-            f"{files} must be minimal terrains of the archive beside them: {what}: remove both, or run `faultline "
-            "minimise` again"
-        ) from None
+        raise ValueError(f"{rule}: {what}: remove both, or run `faultline minimise` again") from None
     # A search that went on may have found others of these numbers.
     names = list(zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True))
     rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]

@@ -66,10 +66,8 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
     """Tries each certifier on the robot; refuses the searched controller, which cannot certify itself."""
     for name, policy in certifiers.items():
         if controller_hash(policy) is None:
-            raise ValueError(
-                f"certifier {name} must have a file, by whose hash certificates name it, got {policy}, where there is "
-                "none: give the path of one"
-            )
+            rule = f"certifier {name} must have a file, by whose hash certificates name it"
+            raise ValueError(f"{rule}, got {policy}, where there is none: give the path of one")
         if is_searched(search.cfg, policy, search.robot):
             raise ValueError(f"certifier {name} must be another controller than the searched one, got {policy}")
         try:

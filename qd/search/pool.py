@@ -11,14 +11,7 @@ from scipy.special import ndtr
 
 from qd.faults.numbers import FRESH_EPISODES
 from qd.search.descriptors import Cells
-from qd.search.fitness import (
-    BIT_EPISODES,
-    FITNESS_FLOOR,
-    Evaluation,
-    FitnessCfg,
-    join_evaluations,
-    merge_evaluations,
-)
+from qd.search.fitness import BIT_EPISODES, FITNESS_FLOOR, Evaluation, FitnessCfg, join_evaluations, merge_evaluations
 
 DEPTH = 3
 """Terrains that each cell has at most."""

@@ -71,9 +71,8 @@ def choose_device(name: str | None, workers: str | None = None) -> str:
     if not on_ray:
         device = resolve_device(name)
         if device.startswith("cuda") and (count or 1) > 1:
-            raise ValueError(
-                f"{count} workers need the CPU, got device {device}: give --device cpu, or --workers ray:N"
-            )
+            remedy = "give --device cpu, or --workers ray:N"
+            raise ValueError(f"{count} workers need the CPU, got device {device}: {remedy}")
         return device
     connect(count)
     if name not in (None, "cpu", "cuda"):
@@ -108,10 +107,8 @@ def connect(count: int | None) -> None:
         ray.init(address=address, **quiet)
     except Exception as error:  # of many types: no such host, another version of Ray, a token that is missing
         reason = " ".join(str(error.__cause__ or error).split())[:300]
-        raise OSError(
-            f"no Ray cluster at RAY_ADDRESS={address}: {reason}: start one with `ray start --head`, or unset "
-            "RAY_ADDRESS to use this machine alone"
-        ) from None
+        remedy = "start one with `ray start --head`, or unset RAY_ADDRESS to use this machine alone"
+        raise OSError(f"no Ray cluster at RAY_ADDRESS={address}: {reason}: {remedy}") from None
 
 
 def load_ray() -> Any:

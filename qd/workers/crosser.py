@@ -95,9 +95,8 @@ class Crosser(ExitStack):
         not say why an episode is invalid.
         """
         if replicas < 1 or engine not in get_args(Engine):
-            raise ValueError(
-                f"replicas must be 1 or more, engine one of {get_args(Engine)}, got {replicas} and '{engine}'"
-            )
+            rule = f"replicas must be 1 or more, engine one of {get_args(Engine)}"
+            raise ValueError(f"{rule}, got {replicas} and '{engine}'")
         cfg = PipelineCfg(
             compute=self.compute, robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)),
             replicas=replicas, engine=engine, space=terrains.space.name, reward=reward, record=record,
