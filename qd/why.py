@@ -198,7 +198,7 @@ def explain_walk(robot: RobotCfg, policy: str, compute: Compute) -> None:
 def describe_row(robot: RobotCfg) -> ControllerCfg:
     """The description of weights that see the robot's row (docs/controllers.md)."""
     terms = [Term(term=name, scale=scale) for name, scale in ROW_SCALES.items()]
-    if robot.num_scan_points:
+    if robot.scan_x and robot.scan_y:
         terms.append(Term(term="scan", order="y fastest", offset=0.5, clip=1.0, scale=5.0))
     return ControllerCfg(policy="", action_scale=robot.action_scale, action_clip=100.0, observation=tuple(terms))
 

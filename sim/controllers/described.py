@@ -63,8 +63,7 @@ class Term:
     period_s: PositiveFloat | None = None
     """Period of a clock [s]."""
     order: str | None = None
-    """Of a scan's points "x fastest" or "y fastest", of a quaternion "w x y z" or "x y z w", of a clock "sin cos",
-    of a command "v_x v_y yaw_rate"."""
+    """Of a scan "x fastest", of a quaternion "w x y z", of a clock "sin cos", of a command "v_x v_y yaw_rate", ..."""
     x: tuple[float, ...] | None = None
     """Points of a scan ahead of the base, yaw frame [m]; the robot's ``scan_x`` if None."""
     y: tuple[float, ...] | None = None

@@ -119,14 +119,13 @@ def _judge(robot: RobotCfg, episodes: EpisodeStates, running: NDArray[np.intp], 
     """Outcome of each running episode after a physics step, the gravest of several."""
     cfg = CrossingCfg
     qpos = episodes.qpos[running]
-    qvel = episodes.qvel[running]
     position = qpos[:, :2]
     outcome = np.full(len(running), Outcome.RUNNING)
     outcome[((position < cfg.lower) | (position > cfg.upper)).any(axis=1)] = Outcome.OUT
     outcome[np.hypot(*(cfg.goal - position).T) < cfg.goal_radius] = Outcome.GOAL
     force = np.linalg.norm(episodes.forces[running][:, base], axis=2).max(axis=1)
     outcome[force > cfg.base_force] = Outcome.BASE_COLLISION
-    finite = np.isfinite(qpos).all(axis=1) & (np.abs(qvel) <= robot.max_speed).all(axis=1)
+    finite = np.isfinite(qpos).all(axis=1) & (np.abs(episodes.qvel[running]) <= robot.max_speed).all(axis=1)
     outcome[~finite | episodes.warned[running]] = Outcome.INVALID
     return outcome
 
@@ -165,10 +164,9 @@ def cross_in_mujoco_c(
             break
         if step % robot.decimation == 0:
             qpos = episodes.qpos[running]
-            qvel = episodes.qvel[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, robot.speed)
-            seen = (heights, qpos, qvel, command[running], last_action[running])
+            seen = (heights, qpos, episodes.qvel[running], command[running], last_action[running])
             row = observations(*seen, default_joint_pos=default, scan=scan)
             touches = 0.01 * np.linalg.norm(episodes.forces[running][:, feet], axis=2)
             senses = {"pose": qpos[:, :7], "contacts": touches, "torques": 0.01 * episodes.torques[running]}
@@ -236,8 +234,7 @@ class MujocoC:
     def take(self, progress: Callable[[float], None] | None = None) -> RolloutResult:
         """Cross the lot that was put in first."""
         terrains = self._pending.popleft()
-        heights = terrains.heights
-        ground = terrains.ground
+        heights, ground = terrains.heights, terrains.ground
         if heights is None:
             heights, ground = make_terrains(terrains.values, terrains.space, device=self._device)
         results = []

@@ -171,8 +171,7 @@ def _lay_ground(model: Any, robot: RobotCfg, friction: Array, time_constant: Arr
             )
     first = int(np.flatnonzero(of_robot)[0])
     model.geom_friction[geoms] = model.geom_friction[first]
-    sliding = max(model.geom_friction[first, 0], GROUND_FRICTION)
-    model.geom_friction[geoms, 0] = sliding * friction
+    model.geom_friction[geoms, 0] = max(model.geom_friction[first, 0], GROUND_FRICTION) * friction
     model.geom_solref[geoms] = model.geom_solref[first]
     model.geom_solimp[geoms] = model.geom_solimp[first]
     soft = time_constant > max(model.geom_solref[first, 0], 0.0)

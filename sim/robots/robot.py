@@ -143,16 +143,11 @@ class RobotCfg:
         return self.footprint[1]
 
     @property
-    def num_scan_points(self) -> int:
-        """Number of height-scan points."""
-        return len(self.scan_x) * len(self.scan_y)
-
-    @property
     def column_sizes(self) -> tuple[int, ...]:
         """Columns of the observation row: of velocities, gravity, command (2, 1), joints, scan, senses (pose: 3, 4)."""
-        joints, pose = self.num_joints, "pose" in self.senses
+        joints, points, pose = self.num_joints, len(self.scan_x) * len(self.scan_y), "pose" in self.senses
         feet, torques = len(self.foot_geoms) * ("contacts" in self.senses), joints * ("torques" in self.senses)
-        return (3, 3, 3, 2, 1, joints, joints, joints, self.num_scan_points, 3 * pose, 4 * pose, feet, torques)
+        return (3, 3, 3, 2, 1, joints, joints, joints, points, 3 * pose, 4 * pose, feet, torques)
 
     @property
     def observation_size(self) -> int:

@@ -209,7 +209,7 @@ def _observation_case(scene: Scene) -> Case:
     scale = constant(LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE)
     # A scan point: three nodes read, one value written; rotation (8), cell and interpolation (10), clip (4). Joint
     # coordinates and velocities, command and action read; three vectors turned into the base (100).
-    points, joints = robot.num_scan_points, robot.num_joints
+    points, joints = len(robot.scan_x) * len(robot.scan_y), robot.num_joints
     values = 4 * points + (7 + 1) + (2 * joints + 6) + 3 + joints + (12 + 3 * joints)
     flops = sim.num_envs * (22 * points + 100 + 3 * joints)
     return Case(

@@ -11,10 +11,7 @@ _HIM_TERMS = ("command", "ang_vel", "gravity", "joint_pos", "joint_vel", "last_a
 
 
 def read_legged_gym(path: Path, source: Source) -> Path:
-    """Settings of an environment's configuration, classes as tables; the width of its observation says the terms.
-
-    Returns the exported network beside it, else the last checkpoint.
-    """
+    """Settings of a configuration, whose observation's width says the terms; returns the network or checkpoint."""
     cfg = read_yaml(path)
     control, normalization, terrain = cfg["control"], cfg["normalization"], cfg.get("terrain") or {}
     source.find_model_file(cfg["asset"]["file"])
