@@ -26,10 +26,7 @@ _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
 def _start_warp() -> None:
-    """Starts Warp without the warning that its C++ writes where there is no CUDA driver.
-
-    Every process would write it, workers too. Who chooses a device says it (:func:`sim.device.resolve_device`).
-    """
+    """Starts Warp without the warning by each process that there is no CUDA driver: who chooses a device says it."""
     try:
         stderr = os.dup(2)
     except OSError:  # closed: nobody reads it

@@ -72,10 +72,13 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
-        training = begin_finetuning(
-            robot, cfg, run_dir, device=device, settings=settings, saved=saved, elites=elites, start=start
-        )
-        policy = training.run(run.export)
+        if saved is None:
+            facts = first_facts(robot, cfg, elites, start)
+        else:
+            facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
+        mix = Mix(cfg=cfg, elites=elites, device=device)
+        how = {"settings": settings, "saved": saved, "mix": mix, "facts": facts, "start": start}
+        policy = Training(robot, cfg, run_dir, device=device, **how).run(run.export)
     return _write_onnx(policy, robot)
 
 
@@ -142,30 +145,13 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     return TrainingElites(genes=tuple(genes), spaces=spaces, goal_rate=goal_rate, archives=records)
 
 
-def begin_finetuning(
-    robot: RobotCfg,
-    cfg: FinetuneCfg,
-    run_dir: Path,
-    *,
-    device: str,
-    settings: dict[str, Any],
-    saved: dict[str, Any] | None,
-    elites: TrainingElites,
-    start: Start,
-) -> Training:
-    """The fine-tuning of the networks of ``start`` on elites, or of a checkpoint; as of :class:`Training`."""
-    if saved is None:
-        critic_iterations = cfg.recipe.critic_iterations
-        if critic_iterations is None:
-            critic_iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
-        trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
-        facts = {
-            TRAINED_ON: sorted({*chain(*map(hash_elites, elites.genes)), *trained_before}),
-            "critic_iterations": critic_iterations if start.critic is None else 0,
-        }
-    else:
-        facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
-    mix = Mix(cfg=cfg, elites=elites, device=device)
-    return Training(
-        robot, cfg, run_dir, device=device, settings=settings, saved=saved, mix=mix, facts=facts, start=start
-    )
+def first_facts(robot: RobotCfg, cfg: FinetuneCfg, elites: TrainingElites, start: Start) -> dict[str, Any]:
+    """What checkpoint and record of a new fine-tuning say beside its settings."""
+    critic_iterations = cfg.recipe.critic_iterations
+    if critic_iterations is None:
+        critic_iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
+    trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
+    return {
+        TRAINED_ON: sorted({*chain(*map(hash_elites, elites.genes)), *trained_before}),
+        "critic_iterations": critic_iterations if start.critic is None else 0,
+    }

@@ -195,15 +195,12 @@ def _parse(cls: Any, argv: Sequence[str], name: str) -> Any:
 
 
 def _plain_help(cls: Any) -> ConstructorRegistry:
-    """Makes the help of flags plain: no default where it is None, and lines broken by the terminal alone.
-
-    Names in braces are filled with the values of the command's ``help_values()``.
-    """
+    """Makes the help of flags plain: no default where it is None, and lines broken by the terminal alone."""
     registry = ConstructorRegistry()
     hint = tyro.conf.arg(help_behavior_hint=lambda text: "" if text in ("", "None") else f"(default: {text})")
     busy = False
 
-    def join_lines(helptext: Any) -> str | None:
+    def join_lines(helptext: Any) -> str | None:  # and fill names in braces with the command's ``help_values()``
         text: Any = (helptext() if callable(helptext) else helptext) or ""
         return " ".join((text.format_map(cls.help_values()) if "{" in text else text).split()) or None
 

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels.ground import FIRM, Ground, make_ground
+from kernels.ground import Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
+from kernels.launch import make_struct
 from sim.device import host_device
 from sim.terrains.conditions.kinds import nominal_row
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
@@ -56,7 +57,8 @@ class TerrainBank:
 
     def set(self, terrains: Terrains, slots: slice = _ALL) -> None:
         """Replace the terrains of some slots; without ground their friction and softness change nothing."""
-        replaced, space, ground = self.heights[slots], terrains.space, terrains.ground
+        replaced, space = self.heights[slots], terrains.space
+        ground = terrains.ground or GroundMaps.plain(len(terrains))
         if terrains.has_ground and self.ground is None:
             raise ValueError("terrains have friction or softness, got a bank without maps: give with_ground=True")
         if terrains.has_conditions and self.conditions is None:
@@ -75,21 +77,17 @@ class TerrainBank:
                 raise ValueError(f"heights must have shape {expected} [terrain, row, col], got {heights.shape}")
             if not np.isfinite(heights).all():
                 raise ValueError(f"heights must be finite, got {np.count_nonzero(~np.isfinite(heights))} that are not")
-            ground = ground or GroundMaps.plain(len(heights))
             rows = ground.rows
             replaced.assign(heights.astype(np.float32))
         max_blocks(replaced, self.terrain.ceilings[slots])
         if self.ground is not None:
-            maps = Ground()
-            maps.friction = self.ground.friction[slots]
-            maps.time_constant = self.ground.time_constant[slots]
-            if ground is None:
-                maps.friction.fill_(1.0)
-                maps.time_constant.fill_(FIRM)
+            maps = make_struct(
+                Ground, friction=self.ground.friction[slots], time_constant=self.ground.time_constant[slots]
+            )
+            maps.friction.assign(np.float32(ground.friction))
+            maps.time_constant.assign(np.float32(ground.time_constant_s))
+            if genes is not None:
                 space.lay_ground(genes, maps)
-            else:
-                maps.friction.assign(np.float32(ground.friction))
-                maps.time_constant.assign(np.float32(ground.time_constant_s))
         if self.conditions is not None:
             self.conditions[slots].assign(np.float32(rows))
 

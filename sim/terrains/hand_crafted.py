@@ -60,13 +60,11 @@ def _noise(rng: np.random.Generator, amplitude: float) -> np.ndarray:
 
 
 def _boxes(rng: np.random.Generator, height: float) -> np.ndarray:
-    """20 boxes of 1-2 m sides, each ``height`` or half of it [m] above or below the ground; a later one overwrites.
-
-    None reaches the square's edge: beyond a tile its edge heights continue, and a box there would become a ridge.
-    """
+    """20 boxes of 1-2 m sides, each ``height`` or half of it [m] above or below the ground; a later one overwrites."""
     heights = np.zeros((_SIDE, _SIDE))
     for _ in range(_NUM_BOXES):
         size_y, size_x = rng.integers(*_BOX_CELLS, size=2, endpoint=True)
+        # Not at the edge, whose heights continue beyond a tile: a box there would become a ridge.
         row, col = (rng.integers(1, _SIDE - 1 - size) for size in (size_y, size_x))
         heights[row : row + size_y + 1, col : col + size_x + 1] = height * rng.choice([-1.0, -0.5, 0.5, 1.0])
     return heights

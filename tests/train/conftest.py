@@ -14,10 +14,11 @@ from qd.evaluate.sets import TRAINED_ON, hash_elites
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from train.cfg import CurriculumCfg, FinetuneCfg, PpoCfg, TaskCfg
-from train.finetune import begin_finetuning, find_training_elites
+from train.finetune import find_training_elites, first_facts
 from train.ppo.checkpoint import STD, read_start
 from train.ppo.training import Training
 from train.task.task import CommandTask
+from train.task.tiles import Mix
 
 NUM_ENVS = 6
 CURRICULUM = CurriculumCfg(num_columns=2, noise_columns=1)
@@ -43,7 +44,8 @@ def begun(robot: RobotCfg, cfg: FinetuneCfg, run: Path) -> Training:
     start = read_start(Path(cfg.policy or robot.policy_file), robot)
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims)).sized(robot, "cpu")
     elites = find_training_elites(robot, cfg)
-    return begin_finetuning(robot, cfg, run, device="cpu", settings={}, saved=None, elites=elites, start=start)
+    mix, facts = Mix(cfg=cfg, elites=elites, device="cpu"), first_facts(robot, cfg, elites, start)
+    return Training(robot, cfg, run, device="cpu", settings={}, saved=None, mix=mix, facts=facts, start=start)
 
 
 PPO = PpoCfg(steps_per_env=4, epochs=1, mini_batches=2)

@@ -57,13 +57,11 @@ def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
         raise ValueError("the curriculum needs at least one column, got num_columns 0 and noise_columns 0")
     tile_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     grid = np.empty((NUM_LEVELS, cfg.num_columns + cfg.noise_columns, NUM_ROWS, NUM_COLS), np.float32)
-    types = ("noise",) * cfg.noise_columns
-    if cfg.num_columns:
-        tiles, type_index = training_tiles(cfg.num_columns, tile_rng)
-        grid[:, : cfg.num_columns] = tiles.reshape(NUM_LEVELS, cfg.num_columns, NUM_ROWS, NUM_COLS)
-        types = (*(TILE_TYPES[k] for k in type_index), *types)
+    tiles, type_index = training_tiles(cfg.num_columns, tile_rng)
+    grid[:, : cfg.num_columns] = tiles.reshape(NUM_LEVELS, cfg.num_columns, NUM_ROWS, NUM_COLS)
     for level, column in np.ndindex(NUM_LEVELS, cfg.noise_columns):
         grid[level, cfg.num_columns + column] = crossing_terrain("noise", level, noise_rng)
+    types = (*(TILE_TYPES[k] for k in type_index), *("noise",) * cfg.noise_columns)
     return Tiles(heights=grid.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)
 
 

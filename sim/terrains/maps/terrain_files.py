@@ -109,10 +109,7 @@ def encode_terrain(terrain: ExportedTerrain, ending: str) -> bytes:
 
 
 def _encode_mjcf(terrain: ExportedTerrain) -> bytes:
-    """A scene of the terrain alone: its surface, step and solver are the simulation's; gravity is the earth's.
-
-    The geom's friction is below every robot's own: of two MuJoCo takes the larger.
-    """
+    """A scene of the terrain alone: its surface, step and solver are the simulation's; gravity is the earth's."""
     field, solver = as_hfield(terrain.heights), SolverCfg()
     root = ET.Element("mujoco", model=terrain.name)
     option = {"timestep": f"{terrain.timestep:g}", "gravity": "0 0 -9.81", "integrator": "implicitfast"}
