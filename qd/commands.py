@@ -283,8 +283,7 @@ class CheckCommand(ControllerFlags, WorkerFlags):
             differences = compare_log(self.trace, policy, robot)
             print("\n".join(differences) or f"{self.trace} agrees with {policy}.")
             return int(bool(differences))
-        compute = _compute(self)
-        return 0 if check_robot(robot, self.policy, compute=compute, why=self.why) else 1
+        return int(not check_robot(robot, self.policy, compute=_compute(self), why=self.why))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -128,8 +128,7 @@ def all_doses() -> dict[str, Dose]:
 def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     """Some of :func:`all_doses`, in their order, as a command line names them; without ``texts`` all but conditions.
 
-    A text holds words ``stairs_up``, or with other values ``ditch=0.2,0.4``; ``at`` are other quantities of those that
-    have them, ``tread=0.25``.
+    A text holds words ``stairs_up``, with other values ``ditch=0.2,0.4``; ``at`` are other quantities, ``tread=0.25``.
     """
     doses, chosen, others = all_doses(), dict[str, Sequence[float] | None](), dict[str, float]()
     word = ""

@@ -100,9 +100,8 @@ def evaluate(
 ) -> Tables:
     """The tables of controllers, policies by name of which ``shipped`` is the robot's own, on sets of terrains.
 
-    Sets are as of :func:`qd.evaluate.sets.make_sets`; None stands for 24 hand-crafted and 24 hard-random terrains. The
-    robot may be a name or a settings file. Without ``compute`` the CPU crosses. ``seed`` is of bootstraps, ``cache`` a
-    folder where crossings are stored and found again.
+    Sets are as of :func:`qd.evaluate.sets.make_sets`, 24 hand-crafted and 24 hard-random terrains if None. The robot is
+    a name or a settings file. Without ``compute`` the CPU crosses. ``seed`` is of bootstraps, ``cache`` of crossings.
     """
     robot = get_robot(robot)
     sets = sets or make_sets((), _SMALL[0], seed)

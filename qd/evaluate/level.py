@@ -1,7 +1,6 @@
 """How a controller walks over level ground: what a search of a user's robot needs, and the time that a crossing gets.
 
-Where it does not cross level ground, every terrain stops it. So that is measured before anything else, once a robot and
-controller, and stored beside the penalty scales as ``<name>.level.json``.
+Where it does not, every terrain stops it: measured first and once, beside the penalty scales as ``<name>.level.json``.
 """
 
 import math
@@ -69,8 +68,7 @@ def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = Fals
 def give_time(robot: RobotCfg, policy: str, compute: Compute) -> RobotCfg:
     """The robot of a robot.toml with the time that a crossing needs, written there; a time that the user wrote stands.
 
-    That is 12 m at the speed toward the goal on level ground, times 1.25, and at least 20 s. Nothing is written of a
-    controller that does not walk.
+    That is 1.25 times 12 m at its speed toward the goal on level ground, at least 20 s; nothing if it does not walk.
     """
     file = robot.settings_file
     if file is None or file.suffix != ".toml":

@@ -22,10 +22,7 @@ VELOCITY_FROM_S = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Performance:
-    """A controller's numbers on each of T terrains, over the valid episodes; NaN on an invalid terrain.
-
-    A terrain is invalid if over a quarter of its episodes are.
-    """
+    """A controller's numbers on each of T terrains, by valid episodes; NaN where over a quarter of them are invalid."""
 
     values: dict[str, NDArray[np.float64]]
     """Mean of each of :data:`qd.evaluate.labels.MEASURES` on each terrain, shape (T,)."""

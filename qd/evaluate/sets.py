@@ -237,9 +237,8 @@ def make_sets(
 ) -> dict[str, TerrainSet]:
     """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`; without names all possible ones.
 
-    A set has ``count`` terrains; a generated one has fewer if the archive holds out fewer. ``archive`` has the elites
-    for ``generated`` and ``generated_far``, ``independent`` those for ``generated_independent``. ``space`` is that of
-    the hard-random ones.
+    A set has ``count`` terrains, or all that the archive holds out. ``archive`` has the elites for ``generated`` and
+    ``generated_far``, ``independent`` those for ``generated_independent``; hard-random terrains are of ``space``.
     """
     lacking = {*(HELD_OUT if archive is None else ()), *((INDEPENDENT,) if independent is None else ())}
     names = names or [name for name in SETS if name not in lacking]

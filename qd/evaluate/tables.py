@@ -190,8 +190,7 @@ def difference(before: Performance, after: Performance, terrains: TerrainSet, se
 def is_regression(tables: Mapping[str, Any]) -> bool:
     """Whether the goal rate's difference of :data:`COMPARED` elites, new minus old, has an interval wholly below 0.
 
-    A terrain that newly fails alone is no regression, since among hundreds some do by chance. Tables of other sets and
-    controllers have none.
+    A terrain that newly fails is no regression alone: of hundreds some do by chance. Tables of other sets have none.
     """
     pairs = tables["differences"].get(COMPARED)
     interval = pairs["old -> new"]["gain"]["goal"]["interval"] if pairs else None

@@ -218,8 +218,7 @@ def find_failing_causes(archive: Archive, space: TerrainSpace, half_width: float
 def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
     """Number of the family of each terrain, from 0 in the order of its first member, shape (N,).
 
-    Who descends from whom is not recorded. Terrains within :data:`KIN_M` are kin, and kin of kin are one family. Genes
-    have shape (N, num_genes).
+    Terrains within :data:`KIN_M` are kin, and kin of kin are one family. Genes have shape (N, num_genes).
     """
     if not len(genes):
         return np.zeros(0, np.int64)

@@ -159,9 +159,8 @@ class Resolved(Stage):
 class Others(Stage):
     """Lets certifiers cross the failing elites in 20 episodes, at the search's settings and with contact resolved.
 
-    A terrain that a certifier crosses less than half of the time at the search's settings is not crossed with contact
-    resolved, since it cannot get a certificate. Outcomes of a certifier that is not asked stay; another controller of
-    the same name replaces them.
+    Where a certifier crosses less than half of the time at the search's settings, it cannot certify, and does not cross
+    with contact resolved. Outcomes of certifiers not asked stay; another controller of the name replaces them.
     """
 
     name = "others"
@@ -267,9 +266,8 @@ def judge(
 ) -> Archive:
     """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
-    ``stages`` are some of :data:`qd.faults.judge.STAGES`, ``certifiers`` other controllers by name, those of
-    :func:`qd.faults.searches.find_certifiers` if None; robot, policy and space are as
-    :func:`qd.faults.searches.find_search` takes them.
+    ``stages`` are some of :data:`STAGES`, ``certifiers`` other controllers by name, those of :func:`find_certifiers` if
+    None; robot, policy and space are as :func:`qd.faults.searches.find_search` takes them.
     """
     if unknown := [name for name in stages if name not in STAGES]:
         raise ValueError(f"stages must be some of {', '.join(STAGES)}, got {', '.join(unknown)}")

@@ -189,9 +189,8 @@ def rate_numbers(counts: NDArray[np.int64]) -> dict[str, Any]:
 def judgement(archive: Archive, number: int) -> dict[str, Any]:
     """What is known of an elite under other conditions, as JSON values; None where nobody looked.
 
-    ``resolved`` is the rate with contact resolved. ``certificates`` has name and hash of each controller that certifies
-    it, and its rates at the ``searched`` settings and with contact ``resolved``. ``varied`` is a rate under varied
-    conditions, where the elite was crossed so.
+    ``resolved`` is the rate with contact resolved, ``varied`` under varied conditions. ``certificates`` has name and
+    hash of each controller that certifies it, and its rates at the ``searched`` settings and under the same conditions.
     """
     resolved = archive.resolved_outcomes[number]
     varied = archive.varied_outcomes

@@ -100,8 +100,7 @@ class Archive(Evaluation, Subject):
     family: NDArray[np.int64] | None = None
     """Family of each elite (:func:`qd.faults.families.find_families`), shape (N,)."""
     cause: NDArray[np.str_] | None = None
-    """What stops the robot where its typical episode ends (:func:`qd.faults.causes.find_causes`), shape (N,); empty
-    where the elite does not fail."""
+    """What stops the robot where its typical episode ends (:func:`qd.faults.causes.find_causes`); else empty, (N,)."""
 
     resolved_outcomes: NDArray[np.int64]
     """With contact resolved."""

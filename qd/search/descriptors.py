@@ -61,8 +61,7 @@ class Cells:
         """The reachable interval tuples in lexicographic order, shape (num_tuples, num_ratios)."""
         tuples = np.zeros((1, 0), dtype=np.int64)
         for _ in range(self.num_ratios):
-            longer = [np.insert(tuples, 0, index, axis=1) for index in range(self.intervals)]
-            tuples = np.vstack(longer)
+            tuples = np.vstack([np.insert(tuples, 0, index, axis=1) for index in range(self.intervals)])
             tuples = tuples[tuples.sum(axis=1) < self.intervals]
         return tuples[tuples.sum(axis=1) + self.num_ratios > self.intervals]
 

@@ -84,10 +84,7 @@ class Evaluation:
 
     @property
     def spread(self) -> NDArray[np.float64]:
-        """Standard deviations as many episodes would show them, shape (T, P): a few show too little.
-
-        One episode of the usual spread is added.
-        """
+        """Standard deviations as many episodes would show them, (T, P): one episode of the usual spread is added."""
         added = (USUAL_SPREAD * self.penalty_mean) ** 2 / np.maximum(self.counted, 1)[:, None]
         return np.sqrt(self.penalty_std**2 + added)
 

@@ -142,12 +142,7 @@ def _describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers
 def _run_iterations(
     cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: Bar, until: Any
 ) -> None:
-    """Runs the iterations that are left, and saves each.
-
-    A group of emitters asks again as soon as it was told, and its next terrains wait in the pipeline while robots cross
-    other groups' terrains. The order is fixed, and a checkpoint holds what each group has asked for: a search that was
-    stopped and goes on is the same as one that was not.
-    """
+    """Runs the iterations that are left in a fixed order, so that a search that goes on is one that never stopped."""
     space = get_space(cfg.space, cfg.space_sha256)
     num_groups = cfg.scheduler.num_groups
     last = find_last_iteration(cfg, metrics, until)

@@ -290,5 +290,4 @@ METHODS: dict[str, type[Method]] = {
     "hard_random": HardRandom,
     "uniform_random": UniformRandom,
 }
-"""By the names that ``--method`` and files have; a new one is registered before :mod:`qd.search.presets` is imported,
-which takes its settings."""
+"""By the names of ``--method`` and files; a new one comes before the import of :mod:`qd.search.presets`."""

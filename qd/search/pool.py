@@ -1,8 +1,7 @@
 """Which terrain holds a cell when evaluations are noisy.
 
-A search that keeps the best draw keeps the luckiest. Here each cell has a few terrains, and the search crosses them
-again. The one that is expected to add most to the QD score of fresh episodes holds the cell. Deep cells and resampled
-elites are of Flageat and Cully 2023, "Uncertain Quality-Diversity".
+A search that keeps the best draw keeps the luckiest. Here a few terrains a cell are crossed again, and it is held by
+the one that should add most to the QD score of fresh episodes (Flageat and Cully 2023, "Uncertain Quality-Diversity").
 """
 
 import numpy as np
@@ -104,8 +103,7 @@ class Pool:
     def least_known(self, count: int, pending: NDArray[np.int64]) -> NDArray[np.int64]:
         """Numbers of ``count`` terrains to cross again, those with the fewest crossings; none of an empty pool.
 
-        Crossings that are ``pending`` count already, by the numbers of their terrains. If there are few terrains, some
-        come several times.
+        Crossings that are ``pending`` count, by numbers of their terrains. Of few terrains some come several times.
         """
         if self.terrains is None or not len(self):
             return self.number[:0]

@@ -21,10 +21,7 @@ def clock(seconds: float) -> str:
 
 
 class Bar(ExitStack):
-    """How far work is, on stderr: one line of a terminal, with the time left first; elsewhere a line every 30 s.
-
-    The work begins at position ``done`` and ends at ``total``.
-    """
+    """How far work is from ``done`` to ``total``, on stderr: one line of a terminal; elsewhere a line every 30 s."""
 
     def __init__(self, text: str, total: float = 1.0, done: float = 0.0) -> None:
         super().__init__()

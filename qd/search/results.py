@@ -84,8 +84,7 @@ def find_last_iteration(cfg: SearchCfg, metrics: Metrics, until: float | None) -
 def compute_last_tenth(archive: Archive, metrics: Metrics) -> float | None:
     """Share of the elites to stay that were found in the last tenth of the iterations which crossed anything new.
 
-    Elites count by their chance to stay in their cells (:func:`qd.search.pool.chance_to_stay`). None without elites,
-    and of fewer than 20 such iterations.
+    Elites count by :func:`qd.search.pool.chance_to_stay`. None without elites, and of fewer than 20 such iterations.
     """
     exploring = [row["iteration"] for row in metrics if row["terrains"]]
     if len(exploring) < UNTIL_FROM or not len(archive):

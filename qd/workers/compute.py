@@ -42,8 +42,7 @@ class Compute:
     workers: str | None = None
     """Who crosses them, as :func:`parse_workers` takes it; a GPU without Ray needs one process."""
     num_envs: int | None = None
-    """Robots at once over all workers, which take the episodes one after the other; as many as the device is good for
-    if None. It changes no result."""
+    """Robots at once over all workers, which changes no result; as many as the device is good for if None."""
 
     @classmethod
     def resolve(cls, device: str | None = None, workers: str | None = None, num_envs: int | None = None) -> Self:

@@ -1,7 +1,6 @@
 """The crossing service: controllers cross terrains, in lots that fill the device, and what is done is kept on disk.
 
-Whatever crosses terrains calls :class:`Crosser`. A command that was stopped goes on when it is run again, since its
-crossings are found in the cache (:mod:`qd.workers.cache`).
+A command that was stopped goes on when it is run again, with the crossings in the cache (:mod:`qd.workers.cache`).
 """
 
 import hashlib
@@ -90,9 +89,8 @@ class Crosser(ExitStack):
         Penalties are summed from ``penalties_from_s`` of an episode on [s], with ``reward`` the training task's reward
         too; with ``record`` the result has frames, and is not stored. The progress bar shows ``label``, or ``progress``
         gets the share that is done. ``room`` are the terrains of the largest call to come that agrees with this one.
-        Invalid episodes are reported on stderr where they are many; a result without a valid one is returned if
-        ``invalid_ok``. Steps and time of the result are those of the terrains that were not in the cache. MuJoCo C does
-        not say why an episode is invalid.
+        Many invalid episodes are reported on stderr; a result without a valid one is returned if ``invalid_ok``. Steps
+        and time are those of terrains that were not in the cache. MuJoCo C does not say why an episode is invalid.
         """
         if replicas < 1 or engine not in get_args(Engine):
             rule = f"replicas must be 1 or more, engine one of {get_args(Engine)}"
@@ -137,8 +135,8 @@ class Crosser(ExitStack):
         settings = [robot_identity(self.robot), self.robot.penalties, controller]
         settings += [space_key(terrains.space.name, terrains.space.sha256)]
         settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s]
-        settings += [repr(self.robot.training) if cfg.reward else None]  # whose terms the reward has
-        settings += [code_fingerprint(("kernels", "sim"))]
+        terms = repr(self.robot.training) if cfg.reward else None  # that the reward has
+        settings += [terms, code_fingerprint(("kernels", "sim"))]
         key = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:32]
         if key not in self._stored:
             self._stored[key] = StoredCrossings(self._cache, key, self.robot.penalties)

@@ -82,12 +82,11 @@ def find_flaw(result: Any, count: int, replicas: int) -> str | None:
     penalties = result.penalties[~invalid]
     if result.penalties.shape != (*shape, len(result.penalty_names)):
         return f"penalties of shape {result.penalties.shape}"
-    if not (np.isfinite(penalties) & (penalties >= 0.0)).all():
-        return "valid episodes with penalties that are negative or not finite"
-    if ((result.invalidity != 0) != invalid).any():
-        return "invalid episodes without a reason, or valid ones with one"
-    if result.reward is not None and not np.isfinite(result.reward[~invalid]).all():
-        return "valid episodes with rewards that are not finite"
-    if not (result.duration_s > 0.0).all() or not result.physics_steps > 0:
-        return "episodes that took no time"
-    return None
+    rewards = np.zeros(0) if result.reward is None else result.reward[~invalid]
+    flaws = {
+        "valid episodes with penalties that are negative or not finite": (penalties < 0.0) | ~np.isfinite(penalties),
+        "invalid episodes without a reason, or valid ones with one": (result.invalidity != 0) != invalid,
+        "valid episodes with rewards that are not finite": ~np.isfinite(rewards),
+        "episodes that took no time": ~(result.duration_s > 0.0) | (not result.physics_steps > 0),
+    }
+    return next((flaw for flaw, is_wrong in flaws.items() if np.any(is_wrong)), None)

@@ -1,7 +1,6 @@
 """What crosses terrains: one simulation in this process, or one in each of several processes.
 
-Workers are handed whole terrains. An episode depends on its terrain, seed and replica alone, so the result is the same
-however terrains are spread.
+An episode depends on its terrain, seed and replica alone, so the result is the same however terrains are spread.
 """
 
 import multiprocessing
@@ -23,8 +22,7 @@ from sim.terrains.spaces.registry import load_space
 from sim.terrains.terrains import Terrains
 
 Engine = Literal["search", "resolved", "mujoco_c", "mujoco_c_search"]
-"""Physics of the search, or with contact resolved (:func:`sim.crossing.resolved`); MuJoCo C with contact resolved, or
-at the search's settings."""
+"""The search's physics, or with contact resolved (:func:`sim.crossing.resolved`); MuJoCo C resolved, or as searched."""
 Progress = Callable[[float], None]
 """Gets the share that is done, now and then."""
 
@@ -125,8 +123,7 @@ class WorkerStatus(NamedTuple):
 
 
 Simulator = Rollout | RolloutRecorder | MujocoC
-"""Crosses lots of terrains in one process: it takes them in by ``put``, and gives their results in that order by
-``take``."""
+"""Crosses lots of terrains in one process: ``put`` takes them in, ``take`` gives their results in that order."""
 Build = Callable[[PipelineCfg, int], Simulator]
 """Makes a simulator with room for so many terrains; a module-level function, since processes import it by name."""
 

@@ -1,7 +1,6 @@
 """Evaluation by Ray workers, each an actor with one device of a cluster, or of this machine.
 
-Ray places the workers and notices when one dies. What is done here is what Ray cannot know: that a result cannot be
-true, and that other workers are free while one is gone.
+Ray places workers and notices when one dies; it cannot know that a result is untrue, or others free meanwhile.
 """
 
 import socket

@@ -56,10 +56,7 @@ class Networks(nn.Module):
         return torch.cat([*map(self._through, maps, self._layers(1))], dim=1)
 
     def judge(self, maps: Tensor) -> Tensor:
-        """Outputs of each network for the same maps, (batch, *SHAPE, num_maps); on CUDA half precision is enough.
-
-        Float32, shape (batch, MEMBERS, num_out).
-        """
+        """Outputs as of :meth:`forward`, float32, for the same maps (batch, *SHAPE, num_maps); on CUDA in half."""
         if not maps.is_cuda:
             return self(maps.expand(MEMBERS, -1, -1, -1, -1))
         return self._through(maps.half(), *self._layers(MEMBERS))
@@ -141,9 +138,8 @@ class Trainer:
     def run(self, maps: Tensor, targets: Tensor, drawn: Tensor, turned: Tensor) -> None:
         """Takes a step for each batch that was drawn. All tensors are on the device.
 
-        Maps of all terrains are of half precision, shape (N, *SHAPE, num_maps); targets have shape (N, num_out).
-        ``drawn`` are the terrains that each network sees in each step, ``turned`` whether it sees them mirrored, both
-        (steps, batch, MEMBERS).
+        Maps of all terrains are of half precision, shape (N, *SHAPE, num_maps); targets have shape (N, num_out). Which
+        are ``drawn`` in each step for each network, and whether mirrored, ``turned``, are (steps, batch, MEMBERS).
         """
         terrains, turned = drawn.transpose(1, 2), turned.transpose(1, 2)
         if self._batch is None:  # memory of a batch, the same in every step
