@@ -49,8 +49,8 @@ class Simulation:
         overflow: mujoco_warp's overflow bits of the last step, shape (num_envs,).
         contacts: Terrain contacts of the last step.
         parked: 2 for robots that steps leave out, shape (num_envs,).
-        body_q: Body poses at the beginning of the last step, or of the last :meth:`refresh`, world-local frame,
-            transforms of shape (num_envs, bodies_per_env).
+        body_q: Body poses at the beginning of the last step, world-local frame, transforms of shape (num_envs,
+            bodies_per_env).
         column_of_shape: Column in ``geom_force`` of each collision shape of a robot, -1 for none.
         geom_of_shape: The solver's number of each.
         base_com: Mass centre of the base in its frame [m].
@@ -306,11 +306,6 @@ class Simulation:
             values = {"dt": dt, "every": round(self.robot.control_dt / dt)}
             values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
             make_disturb(condition_effects("disturb"))(make_struct(DisturbedStep, self, **values))
-
-    def refresh(self) -> None:
-        """Recompute body poses from the joint coordinates, for who reads them; a physics step does so itself."""
-        state: Any = self._state
-        newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
 
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""

@@ -6,6 +6,7 @@ As a command, ``python -m results.make.common FILE`` exits with 0 if today's sou
 import argparse
 import filecmp
 import json
+import math
 import re
 import shutil
 import sys
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from kernels.episode import Outcome
 from qd.evaluate.measures import valid_interval, valid_mean
@@ -28,7 +30,7 @@ from qd.workers.compute import Compute
 from sim.controllers.spec import controller_identity
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
-from sim.files.intervals import DIFFERENCES, t_interval
+from sim.files.intervals import DIFFERENCES
 from sim.files.provenance import provenance, sources_sha256
 from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
@@ -248,6 +250,15 @@ def published_controllers(script: Script) -> dict[str, str]:
     """The shipped controller as ``base``, and those of ``results/<robot>`` by name."""
     files = {name: script.results / f"{name}.pt" for name in ("C-HC", "C-HR", "C-G", "hardened")}
     return {"base": script.policy, **{name: str(file) for name, file in files.items() if file.exists()}}
+
+
+def t_interval(values: NDArray[np.floating]) -> list[float] | None:
+    """Interval of the mean of a few independent measurements (Student 1908); None for a single one."""
+    count = len(values)
+    if count < 2:
+        return None
+    half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(count)
+    return [float(values.mean()) - half, float(values.mean()) + half]
 
 
 def mean_over_seeds(name: str, values: Sequence[float | None]) -> dict[str, Any]:

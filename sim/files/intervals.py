@@ -34,15 +34,6 @@ def wilson_interval(hits: float, count: int) -> tuple[float, float]:
     return (0.0 if hits == 0 else centre - half), (1.0 if hits == count else centre + half)
 
 
-def t_interval(values: NDArray[np.floating]) -> list[float] | None:
-    """Interval of the mean of a few independent measurements (Student 1908); None for a single one."""
-    count = len(values)
-    if count < 2:
-        return None
-    half = float(stdtrit(count - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(count)
-    return [float(values.mean()) - half, float(values.mean()) + half]
-
-
 @lru_cache(maxsize=3)  # of a few sizes of sets, 80 kB a terrain
 def resamples(count: int, seed: int, draws: int = _BOOTSTRAP_DRAWS) -> NDArray[np.float64]:
     """How often each of ``count`` terrains is drawn in each resample, shape (draws, count)."""

@@ -7,7 +7,7 @@ import warp as wp
 
 from kernels.ground import Ground, make_ground
 from kernels.heightfield import Terrain, ceiling_shape, max_blocks
-from kernels.launch import make_struct
+from kernels.launch import make_struct, make_zeros
 from sim.device import host_device
 from sim.terrains.conditions.kinds import nominal_row
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
@@ -41,10 +41,9 @@ class TerrainBank:
         if num_terrains < 1:
             raise ValueError(f"a bank needs at least 1 terrain, got {num_terrains}")
         shape = num_terrains, NUM_ROWS, NUM_COLS
-        self.terrain = Terrain()
-        self.terrain.heights = self.heights = wp.zeros(shape, dtype=float, device=device)
-        self.terrain.ceilings = wp.zeros(ceiling_shape(*shape), dtype=float, device=device)
+        self.terrain = make_zeros(Terrain, device, heights=shape, ceilings=ceiling_shape(*shape))
         self.terrain.spacing = SPACING
+        self.heights = self.terrain.heights
         self.ground: Ground | None = make_ground(num_terrains, device) if with_ground or with_conditions else None
         nominal = np.tile(nominal_row(), (num_terrains, 1))
         self.conditions: Any = wp.array(nominal, dtype=float, device=device) if with_conditions else None

@@ -162,11 +162,10 @@ class Terrains:
         """SHA-256 of each terrain and its seed, but for its space."""
         values = np.ascontiguousarray(self.values, np.float32)
         shape = str(values.shape[1:]).encode()
-        maps: list[bytes] = [b""] * len(self)
-        if self.ground is not None:
-            rows = (self.ground.friction, self.ground.time_constant_s, self.ground.rows)
-            maps = [b"".join(np.float32(array[k]).tobytes() for array in rows) for k in range(len(self))]
+        ground = self.ground
+        rows = () if ground is None else (ground.friction, ground.time_constant_s, ground.rows)
+        maps = [b"".join(np.float32(array[k]).tobytes() for array in rows) for k in range(len(self))]
         return [
-            hashlib.sha256(shape + row.tobytes() + ground + int(seed).to_bytes(4, "little")).digest()
-            for row, ground, seed in zip(values, maps, self.seeds, strict=True)
+            hashlib.sha256(shape + row.tobytes() + patches + int(seed).to_bytes(4, "little")).digest()
+            for row, patches, seed in zip(values, maps, self.seeds, strict=True)
         ]

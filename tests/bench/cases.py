@@ -26,6 +26,7 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 from tests.bench import counterparts
 from tests.bench.ceiling import Work
+from tests.sim.scenes import refresh
 
 FLOAT = 4
 FLOPS_PER_TRIANGLE = 60  # six dot products, their differences, comparisons up to an edge (Ericson's nearest point)
@@ -57,7 +58,7 @@ def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: in
     sim = rollout.sim
     actions = np.random.default_rng(seed).normal(size=(num_envs, robot.num_joints)).astype(np.float32)
     with wp.ScopedDevice(device):
-        sim.refresh()
+        refresh(sim)
         sim.collide()  # of the poses in which the last step ended
         command = wp.zeros((num_envs, 3), dtype=float)
         command_goal(sim.joint_q, wp.zeros(num_envs, dtype=int), make_task(rollout.cfg, robot), command)

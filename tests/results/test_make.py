@@ -240,3 +240,9 @@ def test_results_name_no_path_of_the_machine_that_made_them():
     files = [file for kind in ("*.json", "*.jsonl") for file in MAKE.parent.rglob(kind)]
     place = re.compile(r"(?<![\w.])/(tmp|home|root|work|opt|mnt|usr)/")
     assert files and [str(file) for file in files if place.search(file.read_text())] == []
+
+
+def test_t_interval_by_hand():
+    # Mean 2, standard deviation 1; Student's quantile of 2 degrees of freedom is 4.302653: 2 -+ 4.302653 / sqrt(3).
+    assert common.t_interval(np.array([1.0, 2.0, 3.0])) == pytest.approx([-0.484138, 4.484138], abs=1e-6)
+    assert common.t_interval(np.array([1.0])) is None

@@ -3,7 +3,9 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import newton
 import numpy as np
 import pytest
 import warp as wp
@@ -69,7 +71,13 @@ def put(sim: Simulation, joint_q: np.ndarray, joint_qd: np.ndarray | None = None
     sim.joint_qd.assign(np.zeros(sim.joint_qd.shape, np.float32) if joint_qd is None else np.float32(joint_qd))
     sim.targets.assign(np.float32(joint_q))
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
-    sim.refresh()
+    refresh(sim)
+
+
+def refresh(sim: Simulation) -> None:
+    """Compute body poses from the joint coordinates, for who reads them without a step."""
+    state: Any = sim._state
+    newton.eval_fk(sim.model, state.joint_q, state.joint_qd, state)
 
 
 class Stepper:

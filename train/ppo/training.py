@@ -340,11 +340,10 @@ class TrainingProgress:
     def finish_row(self) -> None:
         """Make a row of the iterations since the last one, if there are any."""
         learner = self._learner
-        window = self._window
+        window, self._window = self._window, []
         task = learner.env.task
         if not window:
             return
-        self._window = []
         collection_s = sum(step.collection_s for step in window)
         learning_s = sum(step.learning_s for step in window)
         sums = task.read_statistics()

@@ -23,7 +23,7 @@ from qd.evaluate.sets import (
 )
 from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables, show_tables
 from qd.search.settings import as_settings
-from sim.files.intervals import t_interval
+from results.make.common import t_interval
 from sim.robots.robot import robot_identity
 from sim.terrains.bank import make_heights
 from sim.terrains.spaces.course import COURSE

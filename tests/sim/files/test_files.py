@@ -22,7 +22,6 @@ from sim.files.intervals import (
     bootstrap_interval,
     format_rate,
     format_value,
-    t_interval,
     wilson_interval,
 )
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
@@ -154,12 +153,6 @@ def test_arrays_are_read_by_name_and_their_shapes_agree(tmp_path):
         read_arrays(path, ["a", "c"])
     with pytest.raises(ValueError, match="a of "):
         read_arrays(path, ["a", "b"], max_bytes=160)
-
-
-def test_t_interval_by_hand():
-    # Mean 2, standard deviation 1; Student's quantile of 2 degrees of freedom is 4.302653: 2 -+ 4.302653 / sqrt(3).
-    assert t_interval(np.array([1.0, 2.0, 3.0])) == pytest.approx([-0.484138, 4.484138], abs=1e-6)
-    assert t_interval(np.array([1.0])) is None
 
 
 def test_wilson_interval_by_hand():
