@@ -11,6 +11,7 @@ agree to rounding. Only the Hessian of a contact on the side of its cone is comp
 semidefinite, so that J^T C J is a sum of squares of combinations of the contact's rows (solver.cu, ``add_contacts``).
 """
 
+import math
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -91,12 +92,12 @@ class Sizes:
 
     @property
     def _floats_per_contact(self) -> int:
-        return _round_up_to_4(self.dimensions * (self.stride + 5) + 1)
+        return 4 * math.ceil((self.dimensions * (self.stride + 5) + 1) / 4)
 
     @property
     def _matrix_floats(self) -> int:
         rows = self.dofs + 1 + _CHUNK * self.dimensions
-        return rows * self.stride + _round_up_to_4(_CHUNK * self.dimensions**2)
+        return rows * self.stride + 4 * math.ceil(_CHUNK * self.dimensions**2 / 4)
 
     @property
     def shared_contacts(self) -> int:
@@ -113,10 +114,6 @@ class Sizes:
     def global_floats(self) -> int:
         """Floats of global memory that a robot needs."""
         return (self.contacts - self.shared_contacts) * self._floats_per_contact
-
-
-def _round_up_to_4(count: int) -> int:
-    return -(-count // 4) * 4
 
 
 @cache
