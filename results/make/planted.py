@@ -69,28 +69,29 @@ def plant_errors(
             replaced.append(f"{error[1].text}: {error[2]:.3f} m/s of {walked:.3f}")
 
 
-def measure(file: Path, device: str, seed: int) -> dict[str, Any]:
-    """What is named for each planted error of a robot.toml."""
+def measure(file: Path, device: str, seed: int, done: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """What is named for each planted error of a robot.toml, with one error more each time, and what was ``done``."""
     robot, path = get_robot(str(file)), file.with_name("controller.toml")
     weights = weights_file(path)
     assert weights is not None
     base = Variant(controller=write_out(read_controller(path), robot), robot=robot)
-    rows = []
+    rows, former = [], {row["planted"]: row for row in done}
     for kind, error, speed, replaced in plant_errors(base, weights, device, seed):
         started = time.perf_counter()
-        ranked = rank_changes(error.variant, weights, device=device)
-        lines = list(describe_ranked(error.variant, ranked))
-        rank = next((k for k, change in enumerate(ranked, 1) if change.variant == base), None)
-        named = ranked[0].variant == base and lines[0].startswith("It walks best")
-        row = {"kind": kind, "planted": error.text, "replaced": replaced, "speed": speed, "named": named, "rank": rank}
-        row |= {"first_line": lines[0], "wall_s": time.perf_counter() - started}
-        print(json.dumps(row), flush=True)
+        if (row := former.get(error.text)) is None:
+            ranked = rank_changes(error.variant, weights, device=device)
+            lines = list(describe_ranked(error.variant, ranked))
+            rank = next((k for k, change in enumerate(ranked, 1) if change.variant == base), None)
+            named = ranked[0].variant == base and lines[0].startswith("It walks best")
+            row = {"kind": kind, "planted": error.text, "replaced": replaced, "speed": speed, "named": named}
+            row |= {"rank": rank, "first_line": lines[0], "wall_s": time.perf_counter() - started}
+            print(json.dumps(row), flush=True)
         rows.append(row)
-    return {**controller_identity(robot, str(path)), "named": sum(row["named"] for row in rows), "errors": rows}
+        yield {**controller_identity(robot, str(path)), "named": sum(row["named"] for row in rows), "errors": rows}
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Plants errors into every controller that is named, and writes the file."""
+    """Plants errors into every controller that is named, and writes the file after each; what is there stays."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robots", type=Path, nargs="+", metavar="ROBOT")
     parser.add_argument("--device", help="a CUDA device if there is one")
@@ -99,13 +100,17 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     args = parser.parse_args(argv)
     device = resolve_device(args.device)
     origin, content = provenance(device, args.seed), dict[str, Any]()
+
+    def read_rows() -> dict[str, Any]:  # of other processes too
+        return read_alike(args.out, origin, "sources_sha256", "seed").get("controllers", {})
+
     for file in args.robots:
-        numbers = measure(file, device, args.seed)
-        rows = read_alike(args.out, origin, "sources_sha256", "seed").get("controllers", {})  # of other processes too
-        rows |= {file.parent.name: numbers}
-        named, planted = sum(row["named"] for row in rows.values()), sum(len(row["errors"]) for row in rows.values())
-        content = origin | {"named": named, "planted": planted, "controllers": rows}
-        write_atomically(args.out, to_json(content))
+        for numbers in measure(file, device, args.seed, read_rows().get(file.parent.name, {}).get("errors", ())):
+            rows = read_rows() | {file.parent.name: numbers}
+            named = sum(row["named"] for row in rows.values())
+            planted = sum(len(row["errors"]) for row in rows.values())
+            content = origin | {"named": named, "planted": planted, "controllers": rows}
+            write_atomically(args.out, to_json(content))
     return content
 
 
