@@ -43,7 +43,7 @@ from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
 
 CONTROLLERS = LEAGUE["controllers"]
-ITERATIONS = 3
+ITERATIONS = 2
 """Of preset wide, at the height that fits; one at each of the common heights."""
 HEIGHTS = (0.05, 0.1, 0.2)
 """Of terrains that all controllers cross, and that are searched against all [m]."""
