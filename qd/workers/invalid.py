@@ -18,7 +18,7 @@ _REASONS = {  # of each Invalidity the words and the remedy
     "action": ("non-finite action", "look at what the controller makes of rare observations, and at its weights"),
     "overflow": ("solver overflow", "raise the robot's nconmax, of which `faultline check` says more"),
     "state": ("non-finite state", "look at the robot's masses, inertias and gains with `faultline check`"),
-    "speed": ("too fast", "raise the robot's max_speed if a falling robot can be that fast, or look at gains and armature"),
+    "speed": ("too fast", "look at gains and armature, or raise max_speed if a falling robot can be that fast"),
 }
 
 
