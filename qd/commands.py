@@ -134,9 +134,10 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         cfg = replace(cfg, **settings, fitness=replace(fitness, alpha=self.alpha, lam=self.lam))
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
         archive = search(cfg, path, compute, robot=robot, policy=policy, until=self.until)
+        named: dict[str, Any] = {"robot": self.robot, "policy": self.policy, "space": self.space}
         if cfg.preset != "small":
-            archive = judge(path, compute=compute, robot=self.robot, policy=self.policy, space=self.space)
-        print_summary(path, archive, robot=self.robot, policy=self.policy, space=self.space)
+            archive = judge(path, compute=compute, **named)
+        print_summary(path, archive, **named, skip_level_ground=self.skip_level_ground)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -134,11 +134,17 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None
 
 
 def print_summary(
-    run: Path, archive: Archive, *, robot: str | None = None, policy: str | None = None, space: str | None = None
+    run: Path,
+    archive: Archive,
+    *,
+    robot: str | None = None,
+    policy: str | None = None,
+    space: str | None = None,
+    skip_level_ground: bool = False,
 ) -> None:
     """Prints what a run's archive says of the controller; nothing without elites.
 
-    Robot, controller and space are as the command line names them, if it does.
+    Robot, controller, space and what was skipped are as the command line names them, if it does.
     """
     if not len(archive):
         return
@@ -158,7 +164,7 @@ def print_summary(
         view=command_line("view", **flags, policies=[f"searched={policy}"] if policy else []),
         report=command_line("report", **flags, policy=policy),
         replay=command_line("replay", **flags, elite=number, policy=policy),
-        judge=command_line("judge", **flags, policy=policy),
+        judge=command_line("judge", **flags, policy=policy, skip_level_ground=skip_level_ground),
         finetune=command_line("finetune", robot=robot, specialist=run, policy=policy, space=space),
     )
     console = Console(highlight=False)

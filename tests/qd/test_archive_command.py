@@ -169,6 +169,8 @@ def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(ca
     assert judging.startswith(f"faultline judge {run} --policy {fine} ")
     print_summary(Path("a b"), replace(found, fresh=fresh_values(found)), policy=fine)
     assert f"faultline finetune --specialist 'a b' --policy {fine} trains" in capsys.readouterr().out
+    print_summary(Path("a b"), found, skip_level_ground=True)
+    assert "faultline judge --run 'a b' --skip-level-ground says" in " ".join(capsys.readouterr().out.split())
 
 
 def test_code_runs_only_if_the_command_line_names_it(capsys):
