@@ -196,7 +196,8 @@ def load_space(name: str | None) -> TerrainSpace:
     if name and len(once) < len(name):
         raise ValueError(f"a space must have each kind of ground and condition once, got {name}: give {once}")
     sha256 = controller_hash(base) if is_user_space(base) else None
-    if sha256 is not None and (base, sha256) not in [(space.name, space.sha256) for space in LOADED]:
+    is_loaded = sha256 is not None and (base, sha256) in [(space.name, space.sha256) for space in LOADED]
+    if is_user_space(base) and not is_loaded:
         parsed = ControllerSpec.parse(base)
         try:
             code: Any = import_object(str(parsed.module), str(parsed.name))

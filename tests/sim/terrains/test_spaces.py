@@ -383,9 +383,12 @@ def test_a_space_is_known_by_the_hash_of_its_code(ridges, tmp_path):
     assert get_space(elsewhere) is changed
 
 
-@pytest.mark.parametrize("name", ["nowhere", "nowhere.py:Space"])
-def test_what_is_no_space(name):
-    with pytest.raises(ValueError, match="nowhere"):
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [("nowhere", "unknown terrain space"), ("nowhere.py:Space", "no such file"), ("sys:maxsize", "num_genes")],
+)
+def test_what_is_no_space(name, problem):
+    with pytest.raises(ValueError, match=f"{name}'.*{problem}|{problem} '{name}'"):
         load_space(name)
 
 
