@@ -41,7 +41,7 @@ _FULL = (20, 4)  # terrains a value and episodes a terrain
 _SMALL = (8, 2)  # on a machine without a GPU
 _COLUMNS = 4
 _RESAMPLES = 1000
-_BEYOND = {"first": "before the first", "last": "beyond the last", None: "-"}
+_BEYOND = {"first": "before the first", "last": "beyond the last", "invalid": "unknown, episodes are invalid"}
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
@@ -241,12 +241,13 @@ def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult)
     """Where under half of the robots begin to reach the goal, by straight lines between the values.
 
     The ``interval`` is 95 % of a bootstrap over the terrains of a value, from the smallest to the largest. None is
-    beyond the values: ``beyond`` the ``first`` or the ``last``.
+    beyond the values: ``beyond`` the ``first`` or the ``last``, or where all episodes of a value are ``invalid``.
     """
     crossed = [number for number, row in enumerate(rows) if row["goal_rate"] is not None]
     half: dict[str, Any] = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
+    unknown = {**half, "value": None, "beyond": "invalid", "interval": [None, None]}
     if not crossed:
-        return {**half, "value": None, "beyond": None, "interval": [None, None]}
+        return unknown
     counted = counted_episodes(result.outcome == Outcome.INVALID)
     hits, counts = (
         mask.sum(axis=1).reshape(-1, len(rows))[:, crossed]
@@ -256,6 +257,10 @@ def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult)
     with np.errstate(invalid="ignore"):
         drawn_steps = [_find_crossing(rates) for rates in (drawn @ hits) / (drawn @ counts)]
     step = _find_crossing(hits.sum(axis=0) / counts.sum(axis=0))
+    # The values between which it lies; outside of all, the last or the first and that beyond it.
+    before, after = np.interp([np.floor(step), np.ceil(step)], range(len(crossed)), crossed)
+    if (after - before > 1) or (step == np.inf and after < len(rows) - 1) or (step == -np.inf and before > 0):
+        return unknown
     steps = (step, *np.quantile(drawn_steps, [0.025, 0.975], method="inverted_cdf"))
     values = [rows[number]["value"] for number in crossed]
     value, *limits = (float(np.interp(at, range(len(values)), values)) if np.isfinite(at) else None for at in steps)

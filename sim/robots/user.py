@@ -30,6 +30,7 @@ _NOT_IN_TOML = ("label", "paper", "settings_file")
 NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
 """What a robot may be called, since files and folders are called after it."""
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
+_MAX_SPEED = 300.0  # light legs get faster than 100 rad/s in falls, and where they shake [rad/s]
 
 
 def is_new_name(name: str) -> bool:
@@ -149,6 +150,7 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
         "scan_x": scan.get("x", []),
         "scan_y": scan.get("y", []),
         "senses": needed_senses([str(term.get("axes", term.get("term"))) for term in terms]),
+        "max_speed": _MAX_SPEED,
     }
     return inferred | roles | given
 
@@ -159,7 +161,7 @@ def describe_inferred(robot: RobotCfg) -> str:
     if file is None or file.suffix != ".toml":
         return ""
     required = [field.name for field in fields(RobotCfg) if field.default is field.default_factory is MISSING]
-    optional = ("default_base_height", *["senses"][: len(robot.senses)])
+    optional = ("default_base_height", "max_speed", *["senses"][: len(robot.senses)])
     names = [name for name in (*required, *optional) if name not in read_toml(file)]
     lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in names]
     return "\n  ".join([f"Inferred; what is not right can be set in {file}:", *lines])

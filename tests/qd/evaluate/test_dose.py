@@ -67,7 +67,24 @@ def test_rows_are_by_value():
     # Half of the second's episodes are invalid, more than a quarter.
     assert (second["goal_rate"], second["interval"], second["episodes"]) == (None, None, 0)
     half = find_half(dose, [first, second], result)
-    assert (half["value"], half["beyond"], half["interval"]) == (None, "last", [None, None])
+    assert (half["value"], half["beyond"], half["interval"]) == (None, "invalid", [None, None])
+
+
+@pytest.mark.parametrize(
+    ("hits", "value", "beyond"),
+    [
+        ([4, 4, 1, None], 0.4 + 0.2 * 2 / 3, None),  # all arrive at .4, a quarter at .6
+        ([4, None, 0, 0], None, "invalid"),  # somewhere between .2 and .6
+        ([4, 4, 4, None], None, "invalid"),
+        ([None, 0, 0, 0], None, "invalid"),
+        ([None, 4, 4, 4], None, "last"),
+    ],
+)
+def test_values_whose_episodes_are_all_invalid_say_nothing(hits, value, beyond):
+    dose = parse_doses(["ditch=0.2,0.4,0.6,0.8"], [])["ditch"]
+    result = result_of([[BAD] * 4 if hit is None else [GOAL] * hit + [HIT] * (4 - hit) for hit in hits])
+    half = find_half(dose, measure_rates("ditch", dose, "a", result), result)
+    assert (half["value"], half["beyond"]) == (value and pytest.approx(value), beyond)
 
 
 @pytest.mark.parametrize(

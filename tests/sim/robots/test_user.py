@@ -57,6 +57,7 @@ def test_what_a_robot_toml_leaves_out_is_what_a_user_would_write(tmp_path):
     assert {*dog.limb_geoms} == {*written.limb_geoms}
     assert dog.penalties == get_robot("anymal").penalties and (dog.scan_x, dog.scan_y) == ((), ())
     assert dog.contact_force_limit == pytest.approx(dogs.MASS * 9.81, rel=5e-3)
+    assert dog.max_speed == 300.0
     # Legs are longest with hips of 0.8 * 0.6 rad, knees of 0.8 * -1.2: soles 0.3 cos 0.48 + 0.025 = 0.2911 m below.
     assert dog.default_base_height == pytest.approx(0.2911, abs=3e-3)
     (file.parent / "dog.xml").write_text(mjcf())  # without a keyframe: 0, and -.1 where knees end
