@@ -44,7 +44,9 @@ from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
 
 CONTROLLERS = LEAGUE["controllers"]
 ITERATIONS = 2
-"""Of preset wide, at the height that fits; one at each of the common heights."""
+"""Of preset wide, at the height that fits."""
+COMMON_EMITTERS = 20
+"""A quarter of preset wide's, of the one iteration at each of the common heights: 4,400 episodes."""
 HEIGHTS = (0.05, 0.1, 0.2)
 """Of terrains that all controllers cross, and that are searched against all [m]."""
 _RISES = "0.02,0.04,0.06,0.08,0.1,0.15,0.2,0.3"
@@ -102,12 +104,16 @@ def search_at(
     *,
     seed: int,
     small: bool,
+    emitters: int | None = None,
     iterations: int = 1,
     stages: tuple[str, ...] = ("fresh",),
 ) -> tuple[Ranking, dict[str, Any]]:
     """A search of terrains of a space, judged: its elites ranked, and its counts."""
     cfg = preset("small" if small else "wide", robot, None, space=space)
-    search(replace(cfg, seed=seed, iterations=iterations), run, compute, robot=robot)
+    cfg = replace(cfg, seed=seed, iterations=iterations)
+    if emitters and not small:
+        cfg = replace(cfg, scheduler=replace(cfg.scheduler, emitters=emitters, groups=emitters // 10))
+    search(cfg, run, compute, robot=robot)
     judge(run, stages=stages, compute=compute, robot=robot.spec)
     ranking, summary = open_run(robot.spec, run).rank(judged=True), RunDirectory(run).read_summary()
     families = len({*ranking.families[ranking.failing].tolist()})
@@ -126,7 +132,8 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     for height in HEIGHTS[: 1 if small else None]:
         out, at = runs / f"{name}-rates-{height:g}.json", at_height(SUPER_GAUSSIAN, height).name
         report = evaluate_rates(robot, policy, compute=compute, space=at, seed=seed, out=out, **sizes)
-        searched = search_at(robot, at, runs / f"{name}-archive-{height:g}", compute, seed=seed, small=small)
+        common = runs / f"{name}-archive-{height:g}"
+        searched = search_at(robot, at, common, compute, seed=seed, small=small, emitters=COMMON_EMITTERS)
         rates[f"{height:g}"] = {key: report[key] for key in ("hand_crafted", "hard_random")} | {"search": searched[1]}
     doses, out = parse_doses(OBSTACLES[:1] if small else OBSTACLES, ()), runs / f"{name}-dose.json"
     terrains = 1 if small else None
