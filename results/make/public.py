@@ -43,8 +43,10 @@ from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
 
 CONTROLLERS = LEAGUE["controllers"]
-ITERATIONS = 2
+ITERATIONS = 1
 """Of preset wide, at the height that fits."""
+ROBOTS_AT_ONCE = 4096
+"""On a GPU, where many of these processes run side by side."""
 COMMON_EMITTERS = 20
 """A quarter of preset wide's, of the one iteration at each of the common heights: 4,400 episodes."""
 HEIGHTS = (0.05, 0.1, 0.2)
@@ -204,7 +206,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
     parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
     args = parser.parse_args(argv)
-    compute = Compute(resolve_device(args.device))
+    device = resolve_device(args.device)
+    compute = Compute(device, num_envs=ROBOTS_AT_ONCE if device.startswith("cuda") else None)
     out = args.out or (Path("runs/make/small") if args.small else Path("results")) / "public.json"
     runs = out.parent / "public" if args.small else runs_of_today() / "public"
     if args.films:
