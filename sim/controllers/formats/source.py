@@ -75,7 +75,11 @@ class Source:
         return file
 
     def set(self, reason: str = "", **settings: Any) -> None:
-        """Stores settings, with the reason if they are guesses."""
+        """Stores settings, with the reason if they are guesses; those of joints must be numbers."""
+        for name, value in settings.items():
+            numbers = [*value.values()] if isinstance(value, dict) else value
+            if name in PER_JOINT and value is not None and np.array(numbers).dtype.kind not in "if":
+                raise ValueError(f"its {name} must be numbers, got {value}")
         self.settings |= settings
         self.reasons |= dict.fromkeys(settings, reason)
 

@@ -496,6 +496,7 @@ def test_what_nobody_says_is_left_to_be_filled_in_and_other_weights_are_never_ta
         (deployment, {"num_actions": 7}, "num_actions"),
         (deployment, {"action_scale": datetime.date(2020, 1, 1)}, "action_scale"),
         (deployment, {"kds": functools.reduce(lambda values, _: [values] * 9, range(9), [0.0])}, "at most 1,000,000"),
+        (deployment, {"kps": "x"}, "stiffness must be numbers, got x"),
         (legged_gym, {"control_type": "T"}, "control_type"),
         (legged_gym, {"hip_scale_reduction": 0.5}, "hip_scale_reduction"),
         (legged_gym, {"stiffness": {"hip": 20.0}}, "none of FL_knee"),
