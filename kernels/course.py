@@ -239,6 +239,9 @@ def lay_out(genes: Any, all_kinds: Kinds, kinds: Sequence[ElementKind]) -> Any:
     Genes, shape (num_terrains, 36), are clipped to [-1, 1], six an element in the order of :data:`GENES`. Elements are
     of ``kinds``, which are among ``all_kinds``; the first of both is flat ground.
     """
+    num_genes = MAX_ELEMENTS * GENES_PER_ELEMENT
+    if genes.ndim != 2 or genes.shape[1] != num_genes:
+        raise ValueError(f"genes must have shape (num_terrains, {num_genes}), got {tuple(genes.shape)}")
     elements = wp.empty((genes.shape[0], MAX_ELEMENTS), dtype=Element, device=genes.device)
     tables = _make_tables(all_kinds, tuple(kinds), str(genes.device))
     _decode_elements(genes, *tables, wp.vec3(*map(float, LEAD[:3])), elements)
@@ -261,4 +264,6 @@ def rasterise_elements(elements: Any, all_kinds: Kinds, heights_out: Any, factor
     Nodes are 0.05 m apart. Heights [m] have shape (num_terrains, nrow, ncol), row along y, column along x, and are
     times ``factor``.
     """
+    if heights_out.ndim != 3 or heights_out.shape[0] != elements.shape[0]:
+        raise ValueError(f"heights_out must have shape ({len(elements)}, nrow, ncol), got {tuple(heights_out.shape)}")
     _make_kernels(all_kinds)[1](elements, factor, heights_out)

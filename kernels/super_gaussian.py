@@ -87,6 +87,10 @@ def rasterise(genes: Any, spacing: float, heights_out: Any, factor: float = 1.0,
     [m] apart; ``origin`` is x and y of the first one [m], 0 if left out. Heights [m], shape (num_terrains, nrow, ncol),
     row along y, column along x, are times ``factor``.
     """
+    if genes.ndim != 2 or genes.shape[1] == 0 or genes.shape[1] % GENES_PER_BUMP != 0:
+        raise ValueError(f"genes must have shape (batch, 8 * num_bumps), got {tuple(genes.shape)}")
+    if heights_out.ndim != 3 or heights_out.shape[0] != genes.shape[0]:
+        raise ValueError(f"heights_out must have shape ({genes.shape[0]}, nrow, ncol), got {tuple(heights_out.shape)}")
     num_bumps = genes.shape[1] // GENES_PER_BUMP
     bumps = wp.empty((genes.shape[0], num_bumps), dtype=Bump, device=genes.device)
     shift = np.pad(origin, (0, GENES_PER_BUMP - len(origin)))

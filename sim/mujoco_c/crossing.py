@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from copy import copy
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,12 @@ _WARNING_NAMES = ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "
 _WARNINGS = [getattr(mj.mjtWarning, f"mjWARN_{name}") for name in _WARNING_NAMES]
 
 
+@lru_cache(maxsize=8)
+def _base_com(robot: RobotCfg) -> Array:
+    """Mass centre of the base in its frame [m]."""
+    return robot_spec(robot).compile().body_ipos[1].copy()
+
+
 def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int, device: str) -> Starts:
     """The starts that :class:`sim.rollout.Rollout` gives to replicas 0 to ``count - 1`` of a terrain with this seed.
 
@@ -40,7 +47,7 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
     """
     bank = TerrainBank(1, device=device)
     bank.set_heights(heights[None])
-    base_com = robot_spec(robot).compile().body_ipos[1].copy()
+    base_com = _base_com(robot)
     with wp.ScopedDevice(device):
         sensors = make_struct(Sensors, default_joint_pos=wp.array(robot.default_joint_pos, dtype=float))
         widths = {"joint_q": 7, "joint_qd": 6, "action": 0}

@@ -43,10 +43,21 @@ def test_courses_equal_the_builders():
     assert [all_elements()[kind].name for kind in np.unique(kinds)] == list(COURSE.kinds)  # every kind is among them
 
 
-def test_courses_refuse_another_spacing():
-    genes, out = (wp.zeros(shape, dtype=float) for shape in ((2, 36), (2, 9, 9)))
-    with pytest.raises(ValueError, match="spacing"):
-        COURSE.rasterise(genes, 0.1, out)
+@pytest.mark.parametrize(
+    ("by", "genes", "heights", "spacing", "field"),
+    [
+        (rasterise, (2, 63), (2, 5, 5), 0.05, "genes"),
+        (rasterise, (2, 8, 8), (2, 5, 5), 0.05, "genes"),
+        (rasterise, (2, 64), (3, 5, 5), 0.05, "heights_out"),
+        (COURSE.rasterise, (2, 64), (2, 161, 321), 0.05, "genes"),
+        (COURSE.rasterise, (2, 36), (3, 5, 5), 0.05, "heights"),
+        (COURSE.rasterise, (2, 36), (2, 9, 9), 0.1, "spacing"),
+    ],
+)
+def test_wrong_shapes_are_named(by, genes, heights, spacing, field):
+    genes, out = (wp.zeros(shape, dtype=float) for shape in (genes, heights))
+    with pytest.raises(ValueError, match=field):
+        by(genes, spacing, out)
 
 
 def test_ground_by_hand():
