@@ -131,8 +131,8 @@ def _half_label(dose: dict[str, Any], element: str) -> str:
     (half,) = (half for half in dose["half"] if half["element"] == element)
     if half["value"] is not None:
         return f"of {100 * half['value']:.0f} cm"
-    is_over = half["beyond"] == "last"
-    return f"of over {100 * _RISES[-1]:.0f} cm" if is_over else f"of less than {100 * _RISES[0]:.0f} cm"
+    bounds = {"first": f"less than {100 * _RISES[0]:.0f} cm", "last": f"over {100 * _RISES[-1]:.0f} cm"}
+    return f"of {bounds.get(half['beyond'], 'unknown height, since episodes are invalid')}"
 
 
 def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:

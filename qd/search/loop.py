@@ -167,9 +167,11 @@ def _run_iterations(
             results.append(pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups)))
             refuse_all_invalid(results[-1])
             evaluations.append(evaluate_rollout(results[-1], cfg.cells, cfg.fitness))
-            if not metrics and group == 0:
-                failing = (evaluations[0].goal_rate < FAILING_GOAL_RATE).sum()
-                print(f"After {time.monotonic() - BEGAN:.0f} s the first {failing} failing terrains.", flush=True)
+            if not metrics:
+                failing = [(evaluation.goal_rate < FAILING_GOAL_RATE).sum() for evaluation in evaluations]
+                if failing[-1] and not any(failing[:-1]):
+                    seconds = time.monotonic() - BEGAN
+                    print(f"After {seconds:.0f} s the first {failing[-1]} failing terrains.", flush=True)
             emitters_began = time.perf_counter()
             num_new += scheduler.tell(evaluations[-1], iteration, group)
             genes = ask(group, iteration + 1)
