@@ -52,15 +52,23 @@ class SearchCfg(Subject):
         return self.scheduler.num_terrains * self.replicas
 
 
-def preset(name: str, robot: RobotCfg, policy: str | None = None, **space: Any) -> SearchCfg:
-    """Settings of a preset's search; without ``policy`` of the robot's own controller. ``space`` has name and hash."""
+def preset(
+    name: str,
+    robot: RobotCfg,
+    policy: str | None = None,
+    *,
+    space: str = "super_gaussian",
+    space_sha256: str | None = None,
+) -> SearchCfg:
+    """Settings of a search by the name of a preset; without ``policy`` of the robot's own controller."""
     return SearchCfg(
         robot=robot.name,
         **robot_identity(robot),
         preset=name,
         policy=policy or SHIPPED,
         policy_sha256=controller_hash(resolve_policy(policy or SHIPPED, robot)),
-        **space,
+        space=space,
+        space_sha256=space_sha256,
         collision_bit=robot.collision_bit,
         fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy)),
         **read_preset(name),

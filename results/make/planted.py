@@ -75,6 +75,7 @@ def measure(file: Path, device: str, seed: int, done: Sequence[dict[str, Any]]) 
     weights = weights_file(path)
     assert weights is not None
     base = Variant(controller=write_out(read_controller(path), robot), robot=robot)
+    identity = controller_identity(robot, str(path))
     rows, former = [], {row["planted"]: row for row in done}
     for kind, error, speed, replaced in plant_errors(base, weights, device, seed):
         started = time.perf_counter()
@@ -87,7 +88,7 @@ def measure(file: Path, device: str, seed: int, done: Sequence[dict[str, Any]]) 
             row |= {"rank": rank, "first_line": lines[0], "wall_s": time.perf_counter() - started}
             print(json.dumps(row), flush=True)
         rows.append(row)
-        yield {**controller_identity(robot, str(path)), "named": sum(row["named"] for row in rows), "errors": rows}
+        yield {**identity, "named": sum(row["named"] for row in rows), "errors": rows}
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
