@@ -13,13 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from statistics import mean
 from typing import Any
 
 from qd.evaluate.labels import HELD_OUT, SETS
 from sim.files.intervals import format_value
 
 ROOT = Path(__file__).parents[2]
+PICTURES = ROOT / "docs/pictures"
 ROBOTS = {"anymal": "ANYmal C", "cassie": "Cassie"}
 CONTROLLERS = ("base", "C-HC", "C-HR", "C-G", "hardened")
 NONE = "-"
@@ -189,21 +189,6 @@ def methods(robot: str) -> str:
         rows[method] = dict(means)
         for key in columns.values():
             rows[method][f"{key}_interval"] = [end(row[key] for row in searches) for end in (min, max)]
-    return table(rows, columns)
-
-
-def noise() -> str:
-    """Designs of a search under noise: means over their seeds, without the long searches."""
-    designs: dict[str, list[Any]] = {}
-    for robot, label in ROBOTS.items():
-        for row in read(f"results/{robot}/search_noise.json").get("rows", ()):
-            if row["search"] == f"{row['design']}, seed {row['seed']}":
-                designs.setdefault(f"{label}, {row['design']}", []).append(row)
-    columns: dict[str, Column] = {**counts("episodes", "elites", "corrected_elites", "failing", "families")}
-    keys = ("elites_same_cell", "two_lots_agree", *map(str, columns.values()))
-    rows = {name: {key: mean(row[key] for row in searches) for key in keys} for name, searches in designs.items()}
-    columns["again in their cell"] = lambda row: f"{row['elites_same_cell'] / row['elites']:.2f}"
-    columns["two fresh lots"] = shown("two_lots_agree", form=".2f")
     return table(rows, columns)
 
 
@@ -389,21 +374,25 @@ def league() -> str:
         """A cell: the size of an obstacle that half of the robots cross."""
         return lambda row: next((format_size(h, row["dose"]) for h in row["half"] if h["element"] == name), NONE)
 
-    def at_heights(*keys: str, form: str = "") -> Callable[[Any], str]:
+    def at_heights(*keys: str, form: str = ".2f") -> Callable[[Any], str]:
         """A cell: a number at each of the common heights."""
         heights = ("0.05", "0.1", "0.2")
         return lambda row: " / ".join(shown(*keys, form=form)(row.get("rates", {}).get(h, {})) for h in heights)
 
     ends = ("", "_mujoco_c", "_publisher")
     columns: dict[str, Column] = {
+        "licence": lambda row: row["licence"],
         "level ground [m/s]": lambda row: " / ".join(shown("check", f"flat_speed{e}", form=".3f")(row) for e in ends),
-        "hand-crafted": at_heights("hand_crafted", "goal_rate", form=".2f"),
-        "hard-random": at_heights("hard_random", "goal_rate", form=".2f"),
+        "time [s]": shown("max_duration_s", form=".1f"),
+        "hand-crafted": at_heights("hand_crafted", "goal_rate"),
+        "hard-random": at_heights("hard_random", "goal_rate"),
         "kerb": half("step_up"),
         "stairs": half("stairs_up"),
         "payload": half("payload"),
         "delay": half("delay"),
-        "failing families": at_heights("search", "failing_families"),
+        "failing families": at_heights("search", "failing_families", form=".0f"),
+        "height [m]": shown("height", form=".2f"),
+        "failing": shown("archive", "failing"),
         "commonest cause": list_causes(1),
     }
     return table(read("results/public.json").get("controllers", {}), columns)
@@ -425,10 +414,10 @@ def drives() -> str:
 
 def films() -> str:
     """A minimal failure of each public controller that has a film."""
-    names = [
-        name for name in read("results/public.json")["controllers"] if (ROOT / f"docs/pictures/{name}.gif").exists()
-    ]
-    return "\n".join(f"![{name}](pictures/{name}.gif)" for name in names)
+    names = [name for name in read("results/public.json")["controllers"] if (PICTURES / f"{name}.gif").exists()]
+    cells = [f"![{name}](pictures/{name}.gif)" for name in names]
+    rows = [["", ""], ["---", "---"], *(cells[k : k + 2] for k in range(0, len(cells), 2))]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def speed() -> str:
@@ -514,7 +503,7 @@ TABLES: dict[str, Callable[..., str]] = {
     make.__name__: make
     for make in (
         *(archives, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement),
-        *(minimal, packs, league, films, drives, speed, kernels, noise, conditions, condition_examples, differences),
+        *(minimal, packs, league, films, drives, speed, kernels, conditions, condition_examples, differences),
     )
 }
 

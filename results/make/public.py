@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from kernels.episode import Outcome
 from qd.check import ensure_ready
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
@@ -22,7 +23,7 @@ from qd.faults.minimise import minimise
 from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.settings import preset
-from qd.show.crossed import find_typical_episode, make_title
+from qd.show.crossed import find_typical_episode
 from qd.show.elites import open_run
 from qd.show.film import GIF_FPS, Shot, as_gif, render_pictures
 from qd.show.replay import save, source_from_run
@@ -37,6 +38,7 @@ from sim.files.atomic import prepare_output, read_json, to_json, write_atomicall
 from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import read_toml
+from sim.rates import typical_outcome
 from sim.robots.find import fitting_space, get_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import MAX_HEIGHT
@@ -188,9 +190,14 @@ def draw_film(name: str, runs: Path) -> None:
         return
     source = source_from_run(opened, minimal=str(opened.minima.numbers["elites"][0]["elite"]))
     (recording,) = source.record("cpu")
-    shot = Shot(
-        recording=recording, episode=find_typical_episode(recording, source.scales), title=make_title(recording)
-    )
+    outcome = recording.outcome[0]
+    stopped = outcome[(outcome != Outcome.GOAL) & (outcome != Outcome.INVALID)]
+    if not len(stopped):
+        return
+    episode = find_typical_episode(recording, source.scales, int(typical_outcome(stopped)))
+    valid = (outcome != Outcome.INVALID).sum()
+    title = f"{name}, {recording.labels[0]}: {len(stopped)} of {valid} do not arrive"
+    shot = Shot(recording=recording, episode=episode, title=title)
     pictures = render_pictures(shot, source.robot, shot.times(GIF_FPS, before_s=1.5, after_s=0.5), FILM_SIZE)
     save(PICTURES / f"{name}.gif", as_gif([*pictures], FILM_BYTES), "Film")
 
