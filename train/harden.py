@@ -45,7 +45,8 @@ _GPU_EPISODES = 400_000
 _SEEDS = 100  # of searches and trainings, apart between hardenings of one seed and the next
 _COUNTS = (
     "terrains_evaluated", "episodes", "elites", "elites_reproduced", "corrected_elites", "families", "failing",
-    "confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families", "certifiers",
+    "failing_families", "failing_distinct", "confirmed", "certified", "faults", "faults_panel", "fault_families",
+    "faults_distinct", "strong", "faults_fdr", "certifiers",
 )  # fmt: skip
 
 

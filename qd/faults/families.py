@@ -1,32 +1,42 @@
 """The elites of an archive by what is known best of each, in groups and in orders to show them in.
 
-Families are terrains so much alike that they are not independent of each other. A cause groups failing elites on which
-parts of one kind stop the robot, such as ridges.
+Kin are terrains so much alike that they are not independent of each other. Families are kin of kin; distinct terrains
+are no kin of one another. A cause groups failing elites on which parts of one kind stop the robot, such as ridges.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 
 from kernels.episode import Outcome
 from qd.faults.causes import UNCLEAR, describe_commonest, find_causes
-from qd.faults.numbers import TEMPLATES, MinimalTerrains, count_faults
+from qd.faults.numbers import TEMPLATES, MinimalTerrains, count_faults, fault_numbers
 from qd.search.archive import Archive
 from qd.search.fitness import FAILING_GOAL_RATE, Evaluation
 from sim.crossing import CrossingCfg
 from sim.terrains.bank import make_heights
-from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.conditions.kinds import condition_genes
+from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from sim.terrains.spaces.wider import WiderSpace
 
 VERDICTS = ("", "failing", "certified", "confirmed", "fault")
 """From the least to the most. The controller may cross with contact resolved what is certified alone."""
 KIN_M = 0.06
-"""Terrains whose heights differ by less (root mean square) are kin [m]. Of 850 hard-random terrains no two are."""
+"""Terrains whose heights differ by less (root mean square) are kin [m], in a space whose bumps are up to 0.25 m high.
+
+Of 850 hard-random terrains no two are.
+"""
+_KIN_SHARE = 0.25  # of a condition's range
 _EVERY = 2  # nodes; distances are compared at 0.1 m
 _BANK = 50  # height maps that are made at once
+_FLAT_M = 1e-3  # RMS height of a flat space [m]
 
 ORDERS = {
     "cause": "faults first, one a cause",
@@ -218,20 +228,65 @@ def find_failing_causes(archive: Archive, space: TerrainSpace, half_width: float
 def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
     """Number of the family of each terrain, from 0 in the order of its first member, shape (N,).
 
-    Terrains within :data:`KIN_M` are kin, and kin of kin are one family. Genes have shape (N, num_genes).
+    Kin of kin are one family. Genes have shape (N, num_genes).
+    """
+    _, families = connected_components(kin_distances(genes, space) < 1.0, directed=False)
+    return families.astype(np.int64)
+
+
+def find_distinct(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.bool_]:
+    """Which terrains are distinct, shape (N,): each that is no kin of a distinct one before it, (N, num_genes)."""
+    distances = kin_distances(genes, space)
+    distinct = np.zeros(len(genes), bool)
+    for row, to_others in enumerate(distances):
+        distinct[row] = (to_others[distinct] >= 1.0).all()
+    return distinct
+
+
+def judged_numbers(archive: Archive, space: TerrainSpace) -> dict[str, Any]:
+    """The numbers of faults (:func:`fault_numbers`), and how many failing elites and faults are distinct."""
+    numbers = fault_numbers(archive)
+    known = {"failing": numbers["failing"] is not None, "faults": numbers["faults_panel"] is not None}
+    for name, chosen in (("failing", archive.failing), ("faults", archive.is_fault)):
+        count = int(find_distinct(archive.genes[chosen], space).sum())
+        numbers[f"{name}_distinct"] = count if known[name] else None
+    return numbers
+
+
+def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:
+    """Distances of terrains, genes of shape (N, num_genes), to each other, shape (N, N); below 1 they are kin.
+
+    A distance is the larger of two: the heights' over :data:`KIN_M`, which is scaled to the space, and the largest
+    change of a condition's number over a quarter of its range.
     """
     if not len(genes):
-        return np.zeros(0, np.int64)
+        return np.zeros((0, 0))
     banks = [make_heights(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
     maps = np.concatenate([bank.reshape(len(bank), -1).astype(np.float64) for bank in banks])
-    _, families = connected_components(rms_distances(maps, maps) < KIN_M, directed=False)
-    return families.astype(np.int64)
+    ranges = np.array([gene.high - gene.low for gene in condition_genes()])
+    conditions = space.condition_rows(genes) / (_KIN_SHARE * ranges)
+    height = height_over_paper(space.inner if isinstance(space, WiderSpace) else space)
+    return np.maximum(rms_distances(maps, maps) / (KIN_M * height), cdist(conditions, conditions, "chebyshev"))
+
+
+@cache
+def height_over_paper(space: TerrainSpace) -> float:
+    """Height of a space without ground and conditions over 0.25 m, the height of the paper's.
+
+    Of a user's space, which has none, the root mean square height of random terrains over that of the paper's.
+    """
+    if isinstance(space, ShippedSpace):
+        return space.height_share
+    user, paper = (each.hard_random(_BANK, 0) for each in (space, SUPER_GAUSSIAN))
+    heights = (make_heights(user, space), make_heights(paper, every=_EVERY))
+    rms_user, rms_paper = (float(np.sqrt(maps.var(axis=(1, 2)).mean())) for maps in heights)
+    return max(rms_user, _FLAT_M) / rms_paper
 
 
 def rms_distances(maps: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square distances of height maps [m], shape (T, num_nodes), to others, (N, num_nodes): shape (T, N)."""
     # In double, since squares are subtracted from each other.
-    squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * maps @ others.T
+    squares = (maps**2).sum(axis=1)[:, None] + (others**2).sum(axis=1) - 2.0 * (maps @ others.T)
     return np.sqrt(np.maximum(squares, 0.0) / maps.shape[1])
 
 

@@ -15,9 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.sets import hash_elites, read_trained_on
-from qd.faults.families import find_failing_causes, find_families
-from qd.faults.numbers import EPISODES, FRESH_EPISODES, VARIED_NUMBERS, fault_numbers, found_numbers, fresh_numbers
+from qd.faults.families import find_failing_causes, find_families, judged_numbers
+from qd.faults.numbers import EPISODES, FRESH_EPISODES, VARIED_NUMBERS, found_numbers, fresh_numbers
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
 from qd.search.archive import ARCHIVE_FILE, OUTCOMES, Archive, FreshValues, goal_rates, write_archive
 from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
@@ -27,7 +26,7 @@ from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import Crosser
 from qd.workers.pipeline import PipelineCfg, build_simulator
 from qd.workers.seeds import Stream
-from sim.controllers.spec import ControllerSpec, controller_hash, controller_identity
+from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.wider import varied_genes, varied_space
@@ -285,33 +284,17 @@ def judge(
     return archive
 
 
-def find_seen(archive: Archive, families: NDArray[np.int64], certifiers: Mapping[str, str]) -> NDArray[np.bool_] | None:
-    """Whether each certifier has trained on kin of each elite, shape (N, C); None if a training record lacks."""
-    marks = np.array(hash_elites(archive.genes))
-    columns = []
-    for name in archive.certifiers:
-        if (policy := certifiers.get(name)) is None:
-            return None
-        trained_on = read_trained_on(policy)
-        records = [file.with_suffix(".train.json") for file in ControllerSpec.parse(policy).files]
-        if not trained_on and not any(record.is_file() for record in records):
-            return None
-        columns.append(np.isin(families, families[np.isin(marks, [*trained_on])]))
-    return np.stack(columns, axis=1) if columns else None
-
-
 def _write(archive: Archive, judging: Judging, stage: str) -> None:
     """Writes archive, numbers and figures of a run after a stage."""
     run = RunDirectory(judging.search.run)
-    assert archive.fresh is not None and archive.family is not None
-    seen = find_seen(archive, archive.family, judging.certifiers) if archive.is_judged else None
+    assert archive.fresh is not None
     file = run.path / SUMMARY_FILE
     numbers = read_json(file) if file.exists() else {}
     numbers = {name: value for name, value in numbers.items() if name not in VARIED_NUMBERS}
     metrics = run.read_metrics() if (run.path / METRICS_FILE).exists() else []
     if len(metrics) >= archive.iterations:  # a search that was stopped has not written its numbers
         numbers |= found_numbers(archive, metrics[: archive.iterations])
-    numbers |= fresh_numbers(archive, archive.fresh) | fault_numbers(archive, archive.family, seen)
+    numbers |= fresh_numbers(archive, archive.fresh) | judged_numbers(archive, judging.search.space)
     numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin}
     write_archive(run.path / ARCHIVE_FILE, archive)
     write_atomically(file, to_json(numbers))

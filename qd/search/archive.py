@@ -165,6 +165,18 @@ class Archive(Evaluation, Subject):
         return self.confirmed & self.certified
 
     @property
+    def strong(self) -> NDArray[np.bool_]:
+        """Whether a fault is a strong one, shape (N,).
+
+        With both kinds of physics the controller crosses under a fifth of the time, and a certifier over four fifths.
+        """
+        if self.fresh is None:
+            return np.zeros(len(self), bool)
+        searched = np.maximum(self.fresh.goal_rate, goal_rates(self.resolved_outcomes))
+        others = np.minimum(*map(goal_rates, (self.certifier_outcomes, self.certifier_resolved_outcomes)))
+        return self.is_fault & (searched < 0.2) & (others > 0.8).any(axis=1)
+
+    @property
     def robust(self) -> NDArray[np.bool_]:
         """Whether a fault is one under varied conditions too, shape (N,).
 

@@ -30,7 +30,8 @@ UNTIL_FROM = 20
 """Iterations that must have crossed anything new before a search is judged by the last tenth of them."""
 _FRESH_NUMBERS = (
     "elites_same_cell", "elites_reproduced", "reevaluated", "corrected_qd_score", "corrected_coverage",
-    "corrected_elites", "mean_fitness_corrected", "mean_std", "mean_std_interval",
+    "corrected_elites", "mean_fitness_corrected", "mean_std", "mean_std_interval", "failing_distinct",
+    "faults_distinct",
 )  # fmt: skip
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _TEMPLATES.filters["escape_markup"] = escape

@@ -41,9 +41,15 @@ SEEDS = (0, 1, 2)
 """Seeds of repeated trainings and searches."""
 ONCE = {"replicas": 20, "batch_size": 20, "again": 0, "candidates": 20}
 """Changes of preset wide: every terrain is crossed once, in the paper's 20 episodes."""
-FRESH_COUNTS = ("episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families")
+FRESH_COUNTS = (
+    "episodes", "elites", "elites_same_cell", "corrected_elites", "failing", "families", "failing_families",
+    "failing_distinct",
+)  # fmt: skip
 """What archive.json counts once fresh episodes are crossed."""
-COUNTS = (*FRESH_COUNTS, "confirmed", "certified", "faults", "faults_panel", "faults_unseen", "fault_families")
+COUNTS = (
+    *FRESH_COUNTS, "confirmed", "certified", "faults", "faults_panel", "fault_families", "faults_distinct", "strong",
+    "faults_fdr",
+)  # fmt: skip
 """... once contact is resolved and others have crossed what fails, too."""
 ARCHIVE_FILES = ("archive.npz", "archive.json", "config.json")
 CURVE_FILE = "curve.json"

@@ -1,7 +1,8 @@
 """How far test terrains lie from the elites C-G was trained on: distances.json, RMS of the heights' differences [m].
 
 Elites of one archive descend from each other, and a held-out one may be a near copy of one that was trained on. Then a
-rate on held-out elites says little of other terrains.
+rate on held-out elites says little of other terrains. For the same reason failing elites and faults of the published
+archives are counted by families, and distinct ones alone.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,8 @@ from qd.evaluate.sets import (
     read_trained_on,
     split_elites,
 )
-from results.make.common import parse, published_controllers
+from qd.faults.families import judged_numbers
+from results.make.common import COUNTS, parse, published_controllers
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -38,7 +40,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     for name, distances in nearest.items():
         least, median, largest = np.quantile(distances, (0.0, 0.5, 1.0)).tolist()
         rows[name] = {"terrains": len(distances), "median": median, "least": least, "largest": largest}
-    return script.write({"iterations": archive.iterations, "trained_on": len(trained_on), "nearest_m": rows})
+    counted = {}
+    for name in ("archive", "archive_cma_mae", "independent"):
+        elites = script.read_archive(name)
+        numbers = judged_numbers(elites, read_space(elites))
+        counted[name] = {"elites": len(elites), **{key: numbers[key] for key in COUNTS if key in numbers}}
+    distances = {"iterations": archive.iterations, "trained_on": len(trained_on), "nearest_m": rows}
+    return script.write({**distances, "archives": counted})
 
 
 if __name__ == "__main__":

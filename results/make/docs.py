@@ -117,11 +117,15 @@ def archives() -> str:
         "*corrected elites*: cells that fresh episodes alone would fill": "corrected_elites",
         "*families* of like terrains": "families",
         "*failing*: under half of the robots cross it in fresh episodes": "failing",
+        "... in families": "failing_families",
+        "... *distinct* ones": "failing_distinct",
         "*confirmed*: failing, also with finer physics": "confirmed",
         "*faults*: confirmed, and a controller of the panel crosses it": "faults_panel",
         "... or one that was trained on these very terrains": "faults",
-        "... by controllers that trained on no such terrain": "faults_unseen",
+        "... that are no luck": "faults_fdr",
         "families of all faults": "fault_families",
+        "*distinct* faults": "faults_distinct",
+        "*strong* faults: crossed in under a fifth, by a certifier in over four fifths": "strong",
         "*robust*: faults under varied conditions, too": "robust",
     }
     return table({name: numbers for name, numbers in rows.items() if numbers}, columns, upright=True)

@@ -120,8 +120,7 @@ def search_at(
     search(cfg, run, compute, robot=robot)
     judge(run, stages=stages, compute=compute, robot=robot.spec)
     ranking, summary = open_run(robot.spec, run).rank(judged=True), RunDirectory(run).read_summary()
-    families = len({*ranking.families[ranking.failing].tolist()})
-    return ranking, {count: summary.get(count) for count in (*COUNTS, "wall_s")} | {"failing_families": families}
+    return ranking, {count: summary.get(count) for count in (*COUNTS, "wall_s")}
 
 
 def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:

@@ -146,7 +146,7 @@ class ViewedRun(OpenedRun):
         kin = int((ranking.families == ranking.families[number]).sum()) - 1
         paragraphs = [
             *describe_judgement(self.archive, number),
-            f"{kin or 'No'} other elite{'s' * (kin > 1)} like it (within 6 cm).",
+            f"{kin or 'No'} other elite{'s' * (kin > 1)} like it.",
             f"Fitness **{ranking.fitness[number]:.2f}** ({self.archive.fitness[number]:.2f} as found in "
             f"iteration {self.archive.iteration[number]}): {FITNESS_TEXT}.",
         ]

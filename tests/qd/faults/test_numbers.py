@@ -5,13 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from qd.faults.families import KIN_M, ORDERS, find_families, rank, summarise_search
+from qd.faults.families import (
+    KIN_M,
+    ORDERS,
+    find_distinct,
+    find_families,
+    judged_numbers,
+    kin_distances,
+    rank,
+    summarise_search,
+)
 from qd.faults.numbers import (
     SPECIALIST,
     MinimalTerrains,
     count_faults,
     describe_judgement,
     fault_numbers,
+    find_significant,
+    fisher_p,
     fresh_counts,
     fresh_numbers,
     judgement,
@@ -19,12 +30,14 @@ from qd.faults.numbers import (
 )
 from qd.search.archive import no_outcomes
 from sim.terrains.bank import make_heights
+from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
+from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.builders import bump, fresh_values, judged_archive, small_archive
 
 
-def pick_numbers(archive, *names, **known):
-    numbers = fault_numbers(archive, **known)
+def pick_numbers(archive, *names):
+    numbers = fault_numbers(archive)
     return tuple(numbers[name] for name in names)
 
 
@@ -34,8 +47,8 @@ def test_numbers_by_hand():
     assert pick_numbers(archive, "certifiers", "crossed_resolved") == (["C-G", "S"], 4)
     (certificates,) = pick_numbers(archive, "certificates")
     assert [(entry["crossed"], entry["certified"]) for entry in certificates] == [(4, 1), (3, 1)]
-    # Nobody trained a specialist, looked for families, or knows what the certifiers were trained on.
-    names = ("faults", "faults_unseen", "families", "fault_families")
+    # Nobody trained a specialist or looked for families.
+    names = ("faults", "families", "failing_families", "fault_families")
     assert pick_numbers(archive, *names) == (None,) * 4 and count_faults(archive) == 1
 
 
@@ -45,13 +58,53 @@ def test_the_specialists_faults_count_beside_those_of_the_panel(certifiers, expe
     assert pick_numbers(archive, "faults", "faults_panel") == expected and count_faults(archive) == 1
 
 
-def test_faults_by_certifiers_that_trained_on_no_kin_and_families_of_faults():
-    # The fault is elite 0, which S crosses; elite 2 is certified by C-G alone and not confirmed.
-    archive, families, seen = judged_archive(), np.array([0, 1, 1, 2, 0]), np.zeros((5, 2), bool)
-    names = ("faults_unseen", "families", "fault_families")
-    assert pick_numbers(archive, *names, families=families, seen=seen) == (1, 3, 1)
-    seen[0, 1] = True
-    assert pick_numbers(archive, *names, families=families, seen=seen) == (0, 3, 1)
+def test_families_of_elites_of_failing_ones_and_of_faults():
+    archive = replace(judged_archive(), family=np.array([0, 1, 1, 2, 3]))  # the first four fail, the first is a fault
+    assert pick_numbers(archive, "families", "failing_families", "fault_families") == (4, 3, 1)
+
+
+def all_faults(fresh_rates, resolved, coarse, fine):
+    """Faults that one certifier crosses: episodes of 20 that reach the goal."""
+    archive = small_archive(len(fresh_rates))
+    counts = [
+        np.stack([goals, 20 - goals, 0 * goals, 0 * goals], axis=1) for goals in map(np.array, (resolved, coarse, fine))
+    ]
+    return replace(
+        archive, fresh=replace(fresh_values(archive), goal_rate=np.array(fresh_rates)), resolved_outcomes=counts[0],
+        certifiers=("C-G",), certifier_sha256=("a" * 64,), certifier_outcomes=counts[1][:, None],
+        certifier_resolved_outcomes=counts[2][:, None]
+    )  # fmt: skip
+
+
+def test_a_strong_fault_is_under_a_fifth_and_over_four_fifths_with_both_kinds_of_physics():
+    archive = all_faults([0.175, 0.2, 0.175, 0.175, 0.175], [3, 3, 4, 3, 3], [17, 17, 17, 16, 17], [17, 17, 17, 17, 16])
+    assert archive.strong.tolist() == [True, False, False, False, False]
+    assert pick_numbers(archive, "faults_panel", "strong") == (5, 1)
+    assert not small_archive(2).strong.any()
+
+
+def test_p_of_more_goals_by_hand():
+    def p(goals, of, others, of_others, invalid=0):
+        return float(fisher_p(np.array([goals, of - goals, 0, invalid]), np.array([others, of_others - others, 0, 0])))
+
+    assert p(3, 3, 0, 3) == pytest.approx(1 / 20)  # 6 over 3
+    assert p(3, 4, 1, 4) == pytest.approx((4 * 4 + 1) / 70)  # 3 of 4 and 1 of 4, or 4 and none, of 8 over 4
+    assert p(0, 3, 3, 3) == 1.0
+    assert p(3, 3, 0, 3, invalid=1) == pytest.approx(1 / 20) and p(3, 3, 0, 3, invalid=2) == p(0, 0, 0, 3) == 1.0
+
+
+def test_significant_are_those_of_the_worse_physics_whose_share_of_luck_is_held():
+    archive = judged_archive()  # the first four fail; two certifiers double each p
+    never, always = ([[0, count, 0, 0] for count in (6, 5, 4, 3, 6)], [[count, 0, 0, 0] for count in (6, 5, 4, 3, 6)])
+    coarse, fine = np.zeros((2, 5, 2, 4), np.int64)
+    coarse[:, 0] = fine[:, 0] = always
+    coarse[3, 1], fine[3, 1] = (6, 0, 0, 0), (0, 6, 0, 0)  # p of 1 / 84 at the search's settings alone
+    archive = replace(
+        archive, resolved_outcomes=np.array(never), certifier_outcomes=coarse, certifier_resolved_outcomes=fine
+    )
+    # 2 / 924, 2 / 252 and 2 / 70 = .029 are under .05 times 1, 2 and 3 of 4; 2 / 20 is over .05.
+    assert find_significant(archive).tolist() == [True, True, True, False, False]
+    assert pick_numbers(archive, "faults_panel", "faults_fdr") == (4, 3)
 
 
 def test_numbers_of_what_nobody_looked_at_are_none():
@@ -236,6 +289,74 @@ def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families(
     for name in ("goal_rate", "collision_rate", "fallen_rate", "fitness"):
         values = getattr(ranking, name)[ranking.order(name)]
         assert np.all(np.diff(values if name == "goal_rate" else -values) >= 0.0) and name in ORDERS
+
+
+class Stripes(TerrainSpace):
+    """Stripes across the way, by turns so high and so deep: the only gene times ``height`` [m]."""
+
+    num_genes = 1
+
+    def __init__(self, height=1.0):
+        self.name, self.height = "stripes", height
+
+    def rasterise(self, genes, spacing, heights_out):
+        heights = np.full(heights_out.shape, self.height, np.float32) * genes.numpy()[:, :, None]
+        heights[:, :, 1::2] *= -1.0
+        heights_out.assign(heights)
+
+    def hard_random(self, count, seed):
+        return np.sign(self.uniform_random(count, seed))
+
+
+class Plates(ShippedSpace):
+    """Level ground as high as the only gene times the height of the space."""
+
+    base_name, num_genes = "plates", 1
+
+    def rasterise(self, genes, spacing, heights_out):
+        heights_out.assign(np.ones(heights_out.shape, np.float32) * self.height * genes.numpy()[:, :, None])
+
+
+@pytest.mark.parametrize("height", [0.25, 0.05])
+def test_distinct_terrains_are_those_that_are_no_kin_of_a_distinct_one_before(height):
+    space, genes = Plates(height=height), np.array([[0.0], [0.2], [0.4], [0.6]], np.float32)
+    # Neighbours are 5 of 6 cm apart, others 10 and more; in a lower space both are a fifth.
+    assert kin_distances(genes, space)[0] == pytest.approx([0.0, 5 / 6, 10 / 6, 15 / 6], rel=1e-5)
+    assert find_families(genes, space).tolist() == [0, 0, 0, 0]
+    assert find_distinct(genes, space).tolist() == [True, False, True, False]
+    assert find_distinct(genes[[1, 0, 2, 3]], space).tolist() == [True, False, False, True]
+    assert find_distinct(genes[:0], space).tolist() == []
+
+
+def test_a_quarter_of_a_conditions_range_is_as_far_as_kin():
+    space = get_space("super_gaussian+payload+motors")
+    genes = np.zeros((4, space.num_genes), np.float32)
+    genes[1:3, 64] = 0.25, 0.3  # payloads of .1 and .12, of a range from -.05 to .4
+    genes[3, 67] = -0.5  # motors at .7, of a range from .4 to 1.2
+    expected = [0.0, 0.1 / 0.1125, 0.12 / 0.1125, 0.3 / 0.2]
+    assert kin_distances(genes, space)[0] == pytest.approx(expected, rel=1e-5)
+    assert find_families(genes, space).tolist() == [0, 0, 0, 1] and find_distinct(genes, space).sum() == 3
+    genes[1] = np.append(SUPER_GAUSSIAN.hard_random(1, 0)[0], genes[1, 64:])
+    heights = make_heights(genes[1:2, :64], every=2)
+    assert kin_distances(genes, space)[0, 1] == pytest.approx(np.sqrt((heights**2).mean()) / KIN_M, rel=1e-5)
+
+
+@pytest.mark.parametrize("height", [1.0, 0.01])
+def test_a_space_without_a_height_is_scaled_by_its_random_terrains(height):
+    # Stripes of a gene of 1 have the root mean square height of the space's random terrains; the paper's is .15 m.
+    distances = kin_distances(np.array([[0.0], [1.0]], np.float32), Stripes(height))
+    assert distances[0, 1] == pytest.approx(0.15 / 0.06, rel=0.05)
+    assert kin_distances(np.ones((2, 1), np.float32), Stripes(0.0)).tolist() == [[0.0, 0.0], [0.0, 0.0]]
+
+
+def test_distinct_elites_are_counted_where_somebody_knows():
+    archive = replace(judged_archive(), genes=np.array([[0.0], [0.2], [0.4], [0.9], [-0.9]], np.float32))
+    numbers = judged_numbers(archive, Plates())  # four fail, one is a fault
+    assert (numbers["failing_distinct"], numbers["faults_distinct"], numbers["faults_panel"]) == (3, 1, 1)
+    alone = replace(archive, **no_outcomes(5), certifiers=(), certifier_sha256=())
+    numbers = judged_numbers(alone, Plates())
+    assert (numbers["failing_distinct"], numbers["faults_distinct"]) == (3, None)
+    assert judged_numbers(replace(alone, fresh=None), Plates())["failing_distinct"] is None
 
 
 def test_kin_of_kin_are_of_one_family_and_families_are_numbered_as_they_come():
