@@ -16,9 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.faults.families import find_failing_causes, find_families, judged_numbers
-from qd.faults.numbers import EPISODES, FRESH_EPISODES, VARIED_NUMBERS, found_numbers, fresh_numbers
+from qd.faults.numbers import (
+    EPISODES,
+    FRESH_EPISODES,
+    FURTHER_NUMBERS,
+    best_certifier,
+    found_numbers,
+    fresh_numbers,
+)
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
-from qd.search.archive import ARCHIVE_FILE, OUTCOMES, Archive, FreshValues, goal_rates, write_archive
+from qd.search.archive import (
+    ARCHIVE_FILE,
+    NO_FURTHER_OUTCOMES,
+    OUTCOMES,
+    Archive,
+    FreshValues,
+    goal_rates,
+    write_archive,
+)
 from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
 from qd.search.fitness import BIT_EPISODES, FAILING_GOAL_RATE, FitnessCfg, evaluate_rollout
 from qd.show import figures
@@ -28,6 +43,7 @@ from qd.workers.pipeline import PipelineCfg, build_simulator
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
+from sim.mujoco_c.model import NO_SOFTNESS
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.wider import varied_genes, varied_space
 from sim.terrains.terrains import Terrains
@@ -186,23 +202,45 @@ class Others(Stage):
                 table[rows, column] = values
                 columns[field] = table
             if hashes != stored:
-                columns |= {"varied_outcomes": None, "certifier_varied_outcomes": None}
+                columns |= NO_FURTHER_OUTCOMES
             archive = replace(archive, certifiers=tuple(hashes), certifier_sha256=tuple(hashes.values()), **columns)
         return archive
 
 
-class Varied(Stage):
-    """Crosses faults under 20 draws of loads, motors, delays, noise and friction, by controller and certifiers."""
+class OfFaults(Stage):
+    """A stage in which the controller and certifiers cross faults again."""
 
-    name = "varied"
     asks_certifiers = True
 
     def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
-        """Refuses a search without faults or that cannot have conditions, and certifiers that are not at hand."""
+        """Refuses a search without faults, and certifiers that are not at hand."""
         super().check(archive, judging, before)
-        if "others" not in before and ("fresh" in before or not archive.is_judged):
-            raise ValueError(f"stages must have others before varied: {judging.search.run} has no faults to cross")
+        faults = archive.certified if "resolved" in before else archive.is_fault
+        if "others" not in before and ("fresh" in before or not faults.any()):
+            raise ValueError(f"stages must have others before {self.name}: {judging.search.run} has no faults to cross")
         self._check_certifiers(archive, judging, renewed="others" in before)
+
+    @staticmethod
+    def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
+        """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
+        hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
+        certificates = archive.certificates[archive.is_fault].T
+        stored = zip(archive.certifiers, archive.certifier_sha256, certificates, strict=True)
+        names = [name for name, digest, certifies in stored if certifies.any() and hashes.get(name) != digest]
+        if lost := [name for name in names if not (renewed and name in hashes)]:
+            rule = f"certifiers must be those that certify faults of {judging.search.run}"
+            remedy = "give the files by --certifiers, or other controllers of these names and the stage others, too"
+            raise ValueError(f"{rule}, got none or another file for {', '.join(lost)}: {remedy}")
+
+
+class Varied(OfFaults):
+    """Crosses faults under 20 draws of loads, motors, delays, noise and friction, by controller and certifiers."""
+
+    name = "varied"
+
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Refuses a search that cannot have conditions, too."""
+        super().check(archive, judging, before)
         if before:  # else the stage itself finds out at once
             search = judging.search
             local = Compute(judging.crosser.compute.device if judging.crosser.compute.on_gpu else "cpu")
@@ -237,20 +275,74 @@ class Varied(Stage):
         print(f"{num_robust} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
         return archive
 
-    @staticmethod
-    def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
-        """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
-        hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
-        certificates = archive.certificates[archive.is_fault].T
-        stored = zip(archive.certifiers, archive.certifier_sha256, certificates, strict=True)
-        names = [name for name, digest, certifies in stored if certifies.any() and hashes.get(name) != digest]
-        if lost := [name for name in names if not (renewed and name in hashes)]:
-            rule = f"certifiers must be those that certify faults of {judging.search.run}"
-            remedy = "give the files by --certifiers, or other controllers of these names and the stages others, varied"
-            raise ValueError(f"{rule}, got none or another file for {', '.join(lost)}: {remedy}")
+
+class InMujocoC(OfFaults):
+    """Crosses 150 faults in MuJoCo C with contact resolved, by the controller, and where it fails by a certifier.
+
+    Each in 6 episodes, and in 4 more unless these decide whether half of the 10 reach the goal.
+    """
+
+    name = "mujoco_c"
+    faults = 150
+    episodes = (6, 4)
+
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Refuses soft ground, too, which MuJoCo C cannot have."""
+        if "softness" in judging.search.space.ground:
+            raise ValueError(NO_SOFTNESS)
+        super().check(archive, judging, before)
+
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with outcomes of the controller, and of the best certifier of each fault that it still fails."""
+        self._check_certifiers(archive, judging)
+        search = judging.search
+        rounds = len(self.episodes)
+        seeds = elite_seeds(archive, search.cfg.seed, rounds, stream=Stream.MUJOCO_C).reshape(-1, rounds)
+
+        def cross(policy: str, rows: NDArray[np.int64], name: str) -> NDArray[np.int64]:
+            outcomes = np.zeros((len(rows), len(OUTCOMES)), np.int64)
+            for number, replicas in enumerate(self.episodes):
+                undecided = ~is_decided(outcomes, sum(self.episodes))
+                chosen = rows[undecided]
+                terrains = Terrains(genes=archive.genes[chosen], seeds=seeds[chosen, number], space=search.space)
+                how: dict[str, Any] = {"replicas": replicas, "engine": "mujoco_c"}
+                outcomes[undecided] += judging.count(policy, terrains, f"{name} in MuJoCo C", **how)
+            return outcomes
+
+        rows = draw_faults(archive, search.cfg.seed, self.faults)
+        outcomes = np.zeros_like(archive.resolved_outcomes)
+        outcomes[rows] = cross(search.policy, rows, "searched")
+        others = np.zeros_like(archive.certifier_outcomes)
+        failing = rows[goal_rates(outcomes[rows]) < FAILING_GOAL_RATE]
+        best = np.array([best_certifier(archive, row) for row in failing.tolist()], np.str_)
+        for column, name in enumerate(archive.certifiers):
+            if (best == name).any():
+                others[failing[best == name], column] = cross(judging.certifiers[name], failing[best == name], name)
+        archive = replace(archive, mujoco_c_outcomes=outcomes, certifier_mujoco_c_outcomes=others)
+        print(f"{archive.holds_in_mujoco_c.sum()} of {len(rows)} faults hold in MuJoCo C.", flush=True)
+        return archive
 
 
-STAGES: dict[str, Stage] = {stage.name: stage for stage in (Fresh(), Resolved(), Others(), Varied())}
+def draw_faults(archive: Archive, seed: int, count: int) -> NDArray[np.int64]:
+    """Rows of at most ``count`` random faults with a certificate, a fault of each family before a second one of any."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed], spawn_key=(Stream.MUJOCO_C,)))
+    rows = rng.permutation(np.flatnonzero(archive.is_fault & archive.certificates.any(axis=1)))
+    assert archive.family is not None
+    _, first = np.unique(archive.family[rows], return_index=True)
+    return np.concatenate([rng.permutation(rows[first]), np.delete(rows, first)])[:count]
+
+
+def is_decided(counts: NDArray[np.int64], episodes: int) -> NDArray[np.bool_]:
+    """Whether the first of ``episodes`` show, however the others end, if half of them reach the goal, shape (N,).
+
+    Counts by :data:`qd.search.archive.OUTCOMES` have shape (N, 4). Not decided as long as too many are invalid.
+    """
+    goal, collided, other, _ = counts.T
+    lead, rest = goal - collided - other, episodes - counts.sum(axis=1)
+    return ((lead >= rest) | (lead < -rest)) & ~np.isnan(goal_rates(counts))
+
+
+STAGES: dict[str, Stage] = {stage.name: stage for stage in (Fresh(), Resolved(), Others(), Varied(), InMujocoC())}
 
 
 def judge(
@@ -290,7 +382,7 @@ def _write(archive: Archive, judging: Judging, stage: str) -> None:
     assert archive.fresh is not None
     file = run.path / SUMMARY_FILE
     numbers = read_json(file) if file.exists() else {}
-    numbers = {name: value for name, value in numbers.items() if name not in VARIED_NUMBERS}
+    numbers = {name: value for name, value in numbers.items() if name not in FURTHER_NUMBERS}
     metrics = run.read_metrics() if (run.path / METRICS_FILE).exists() else []
     if len(metrics) >= archive.iterations:  # a search that was stopped has not written its numbers
         numbers |= found_numbers(archive, metrics[: archive.iterations])

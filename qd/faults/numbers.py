@@ -3,7 +3,7 @@
 An elite fails by its 40 fresh episodes. It is confirmed if it fails with contact resolved too, and certified if another
 controller crosses it, at the search's settings and with contact resolved. A fault is both. A terrain without a
 certificate is not known to be passable. A fault is robust if it is one under varied conditions too
-(:func:`sim.terrains.spaces.wider.varied_genes`).
+(:func:`sim.terrains.spaces.wider.varied_genes`), and it holds in MuJoCo C if it is one there, too.
 """
 
 from collections.abc import Container, Mapping, Sequence
@@ -19,7 +19,7 @@ from scipy.stats import false_discovery_control, hypergeom
 from qd.search.archive import OUTCOMES, Archive, FreshValues, goal_rates
 from qd.search.fitness import FITNESS_FLOOR
 from sim.files.atomic import read_json
-from sim.files.intervals import bootstrap_interval, format_rate, format_value, wilson_interval
+from sim.files.intervals import RATES, bootstrap_interval, format_rate, format_value, wilson_interval
 from sim.files.npz import read_arrays
 from sim.files.templates import open_templates
 
@@ -35,8 +35,8 @@ TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _INVALID = OUTCOMES.index("invalid")
 _FALSE_DISCOVERIES = 0.05  # share of them among what is significant
 _KINDS = {"searched": "", "resolved": " with contact resolved", "varied": " under varied conditions"}
-VARIED_NUMBERS = ("crossed_varied", "robust")
-"""Numbers of :func:`fault_numbers` that an archive has only if it was judged under varied conditions."""
+FURTHER_NUMBERS = ("crossed_varied", "robust", "faults_mujoco_c")
+"""Numbers of :func:`fault_numbers` that an archive has only if its faults were crossed again."""
 MINIMAL_FILE = "minimal.npz"
 MINIMAL_NUMBERS_FILE = "minimal.json"
 _ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "goal_interval", "cause", "margin_m")
@@ -121,6 +121,10 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
         if archive.varied_outcomes is not None:
             numbers["crossed_varied"] = int((is_fault & archive.varied_outcomes.any(axis=1)).sum())
             numbers["robust"] = int(archive.robust.sum())
+        if archive.mujoco_c_outcomes is not None:
+            tried = is_fault & archive.mujoco_c_outcomes.any(axis=1)
+            numbers["faults_mujoco_c"] = _share_held(archive, tried)
+            numbers["faults_mujoco_c"]["strong"] = _share_held(archive, tried & archive.strong)
     return numbers
 
 
@@ -145,6 +149,17 @@ def fisher_p(counts: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np
     valid, other_valid = (ends.sum(axis=-1) - ends[..., _INVALID] for ends in (counts, others))
     p = hypergeom.sf(goals - 1, valid + other_valid, goals + other_goals, valid)
     return np.where(np.isnan(goal_rates(counts) + goal_rates(others)), 1.0, p)
+
+
+def _share_held(archive: Archive, tried: NDArray[np.bool_]) -> dict[str, Any]:
+    """How many of the faults ``tried`` in MuJoCo C hold there, with the interval of their share over families."""
+    holds, family = archive.holds_in_mujoco_c[tried], archive.family
+    count, interval = int(holds.sum()), None
+    if family is not None and len(np.unique(family[tried])) == len(holds):
+        interval = wilson_interval(count, len(holds))
+    elif family is not None:
+        interval = bootstrap_interval(holds.astype(np.float64), 0, families=family[tried], bounds=RATES)
+    return {"tried": len(holds), "hold": count, "interval": interval}
 
 
 def count_faults(archive: Archive) -> int | None:
@@ -186,7 +201,8 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
     if not rates:
         return []
     crossers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
-    known = {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust")}
+    known = {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
+    known["in_mujoco_c"] = archive.mujoco_c_outcomes is not None and archive.mujoco_c_outcomes[number].any()
     return TEMPLATES.get_template("elite.txt").render(rates=rates, crossers=crossers, **known).splitlines()
 
 

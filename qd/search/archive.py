@@ -114,6 +114,10 @@ class Archive(Evaluation, Subject):
     varied_outcomes: NDArray[np.int64] | None = None
     certifier_varied_outcomes: NDArray[np.int64] | None = None
 
+    # In MuJoCo C with contact resolved, of some faults and a certifier each, until decided; None before.
+    mujoco_c_outcomes: NDArray[np.int64] | None = None
+    certifier_mujoco_c_outcomes: NDArray[np.int64] | None = None
+
     def __len__(self) -> int:
         return len(self.fitness)
 
@@ -178,15 +182,22 @@ class Archive(Evaluation, Subject):
 
     @property
     def robust(self) -> NDArray[np.bool_]:
-        """Whether a fault is one under varied conditions too, shape (N,).
+        """Whether a fault is one under varied conditions too, shape (N,)."""
+        return self._is_fault_by(self.varied_outcomes, self.certifier_varied_outcomes)
 
-        The controller crosses in under half of them, and one with a certificate in at least half.
-        """
-        if self.varied_outcomes is None or self.certifier_varied_outcomes is None:
+    @property
+    def holds_in_mujoco_c(self) -> NDArray[np.bool_]:
+        """Whether a fault is one in MuJoCo C too, shape (N,)."""
+        return self._is_fault_by(self.mujoco_c_outcomes, self.certifier_mujoco_c_outcomes)
+
+    def _is_fault_by(
+        self, outcomes: NDArray[np.int64] | None, certifier_outcomes: NDArray[np.int64] | None
+    ) -> NDArray[np.bool_]:
+        """Faults of which the controller crosses under half by other outcomes, and one with a certificate half."""
+        if outcomes is None or certifier_outcomes is None:
             return np.zeros(len(self), bool)
-        fails = goal_rates(self.varied_outcomes) < FAILING_GOAL_RATE
-        crosses = self.certificates & (goal_rates(self.certifier_varied_outcomes) >= FAILING_GOAL_RATE)
-        return self.is_fault & fails & crosses.any(axis=1)
+        crosses = self.certificates & (goal_rates(certifier_outcomes) >= FAILING_GOAL_RATE)
+        return self.is_fault & (goal_rates(outcomes) < FAILING_GOAL_RATE) & crosses.any(axis=1)
 
     @property
     def is_judged(self) -> bool:
@@ -220,14 +231,18 @@ _GROUPED = {"family": "N", "cause": "N"}
 _CERTIFIERS = {"certifiers": "C", "certifier_sha256": "C"}
 _CROSSED = {**_CERTIFIERS, "resolved_outcomes": "N4", "certifier_outcomes": "NC4", "certifier_resolved_outcomes": "NC4"}
 _VARIED = {"varied_outcomes": "N4", "certifier_varied_outcomes": "NC4"}
-_BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _VARIED)  # groups that a file has whole, or not at all
+_MUJOCO_C = {"mujoco_c_outcomes": "N4", "certifier_mujoco_c_outcomes": "NC4"}
+_BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _VARIED, _MUJOCO_C)  # groups that a file has whole, or not at all
 _TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
+
+NO_FURTHER_OUTCOMES: dict[str, Any] = dict.fromkeys((*_VARIED, *_MUJOCO_C))
+"""Columns of an archive whose faults nobody has crossed again."""
 
 
 def write_archive(path: Path, archive: Archive) -> None:
     """Writes an archive as a compressed npz, atomically; equal archives give equal bytes."""
-    groups = [_SETTINGS, _FOUND, _GROUPED, *([_CROSSED, _VARIED] if archive.is_judged else [])]
+    groups = [_SETTINGS, _FOUND, _GROUPED, *([_CROSSED, _VARIED, _MUJOCO_C] if archive.is_judged else [])]
     values = {name: getattr(archive, name) for group in groups for name in group}
     if archive.fresh is not None:
         values |= {_PREFIX + name: column for name, column in vars(archive.fresh).items()}

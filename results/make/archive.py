@@ -3,7 +3,8 @@
 The default method and the paper's method, and the default one again with another seed, to a million episodes. Each is
 a search of preset wide. On the way its elites cross fresh episodes, and curve.json has what they say. A third seed is
 searched for that alone.
-The first two are judged: contact resolved, a specialist trained on what fails, others' crossings, varied conditions.
+The first two are judged: contact resolved, a specialist trained on what fails, others' crossings, varied conditions,
+MuJoCo C.
 """
 
 from collections.abc import Sequence
@@ -55,7 +56,7 @@ def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
     archive = judge(run, stages=("fresh", "resolved"), compute=script.compute)
     if archive.failing.any():
         train_specialist(script.robot, run, FinetuneCfg.specialist(script.robot), RunCfg(device=script.device))
-    judge(run, stages=("others", "varied"), compute=script.compute)
+    judge(run, stages=("others", "varied", "mujoco_c"), compute=script.compute)
     return RunDirectory(run).read_summary()
 
 

@@ -5,11 +5,20 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from qd.faults.judge import count_outcomes, elite_seeds, fresh_values, judge
+from qd.faults.judge import (
+    InMujocoC,
+    count_outcomes,
+    draw_faults,
+    elite_seeds,
+    fresh_values,
+    is_decided,
+    judge,
+)
 from qd.search.archive import read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
@@ -19,7 +28,7 @@ from sim.robots.find import get_robot
 from sim.robots.robot import ROBOTS, RobotCfg
 from sim.terrains.conditions.kinds import condition_column
 from sim.terrains.spaces.registry import get_space
-from tests.builders import small_archive
+from tests.builders import judged_archive, small_archive
 from tests.qd import stand_in
 from tests.qd.robots import OTHER, Robots
 from tests.qd.stand_in import compute_by, make_result
@@ -193,11 +202,12 @@ def test_a_fault_is_robust_if_it_is_one_under_the_same_20_varied_conditions_too(
 def test_only_the_certifiers_of_faults_can_cross_them_under_varied_conditions(path):
     vary(path, judged(path), [])
     nobody = Robots(cross_by_genes, stop_after=0)
-    for stages in (("varied",), ("others", "varied")):
+    for stages in (("varied",), ("others", "varied"), ("mujoco_c",)):
         with pytest.raises(ValueError, match=r"certifiers .*C-G"):
             judged(path, nobody, stages=stages, certifiers={})
-    with pytest.raises(ValueError, match=r"certifiers .*C-G"):
-        judged(path, nobody, stages=("varied",), certifiers={"C-G": WEAK})
+    for stage in ("varied", "mujoco_c"):
+        with pytest.raises(ValueError, match=r"certifiers .*C-G"):
+            judged(path, nobody, stages=(stage,), certifiers={"C-G": WEAK})
     # Another controller of the name has other certificates, so nobody knows any more which faults are robust.
     assert not judged(path, stages=("others",), certifiers={"C-G": WEAK}).robust.any()
     assert not {"robust", "crossed_varied"} & numbers_in(path).keys()
@@ -207,6 +217,67 @@ def test_a_robot_without_conditions_is_refused_before_anything_is_crossed(path, 
     monkeypatch.setattr("sim.solver.is_supported", lambda *_: False)
     with pytest.raises(ValueError, match="robot 'anymal' cannot have conditions"):
         judged(path, Robots(cross_by_genes, stop_after=0), stages=("fresh", "resolved", "others", "varied"))
+
+
+def test_half_of_ten_episodes_is_decided_by_five_that_arrive_or_six_that_do_not():
+    decided = [[5, 0, 0, 0], [0, 4, 2, 0], [5, 4, 0, 0], [4, 6, 0, 0], [4, 0, 3, 2], [4, 5, 0, 1]]
+    # Four of the nine that are valid are under half; 2 of 7 invalid are more than a quarter as yet.
+    undecided = [[0, 0, 0, 0], [0, 5, 0, 0], [2, 1, 2, 0], [4, 5, 0, 0], [4, 4, 0, 1], [5, 0, 0, 2]]
+    assert is_decided(np.array(decided + undecided), 10).tolist() == [True] * 6 + [False] * 6
+
+
+def test_one_fault_a_family_is_drawn_first():
+    archive = judged_archive().rows(np.array([0] * 6 + [1]))  # six times the fault, and one confirmed alone
+    archive = replace(archive, family=np.array([5, 5, 5, 5, 2, 0, 7]))
+    draws = [draw_faults(archive, seed, 5).tolist() for seed in range(20)]
+    assert all({*draw[:3]} - {0, 1, 2, 3} == {4, 5} and len({*draw}) == 5 and 6 not in draw for draw in draws)
+    assert draws[3] == draw_faults(archive, 3, 5).tolist() and {row for draw in draws for row in draw} == {*range(6)}
+    # Families are drawn alike, however many members they have.
+    alone = np.array([draw_faults(archive, seed, 1)[0] for seed in range(200)])
+    assert 40 < (alone == 4).sum() < 95
+
+
+def test_a_fault_holds_in_mujoco_c_if_the_controller_fails_and_its_best_certifier_crosses_until_decided(path):
+    before = judged(path)
+    rows = np.flatnonzero(before.is_fault)
+    seeds = elite_seeds(before, 3, 2, stream=Stream.MUJOCO_C).tolist()
+    arrives, narrow, lost = rows.tolist()
+
+    def rule(cfg, genes, episodes):
+        number, again = np.divmod([seeds.index(seed) for seed in episodes], 2)
+        assert np.array_equal(genes, before.genes[number])
+        assert cfg.engine == "mujoco_c" and {*again} == {int(cfg.replicas == 4)}
+        fails = number == lost if "C-G" in cfg.policy else number != arrives
+        collided = np.repeat(fails[:, None], cfg.replicas, axis=1)
+        if "C-G" not in cfg.policy and cfg.replicas == 6:
+            collided[number == narrow] = [0, 1, 0, 1, 0, 0]  # 4 of 6, and then 4 of 10
+        return stand_in.make_result(np.ones((*collided.shape, 6)), base_collision=collided)
+
+    stopped = Robots(rule, stop_after=3)
+    with pytest.raises(KeyboardInterrupt):
+        judged(path, stopped, stages=("mujoco_c",))
+    rest = Robots(rule)
+    archive = judged(path, rest, stages=("mujoco_c",))
+    assert archive.mujoco_c_outcomes[rows].tolist() == [[6, 0, 0, 0], [4, 6, 0, 0], [0, 6, 0, 0]]
+    assert archive.certifier_mujoco_c_outcomes[rows, 0].tolist() == [[0, 0, 0, 0], [6, 0, 0, 0], [0, 6, 0, 0]]
+    # The controller on three faults, stopped; again on one, and its certifier where it fails.
+    assert [len(robots.crossed) for robots in (stopped, rest)] == [3, 1 + 2]
+    assert np.flatnonzero(archive.holds_in_mujoco_c).tolist() == [narrow]
+    numbers = numbers_in(path)["faults_mujoco_c"]
+    assert (numbers["tried"], numbers["hold"]) == (3, 1)
+    assert np.array_equal(read_archive(path).holds_in_mujoco_c, archive.holds_in_mujoco_c)
+    # Another controller of the certifier's name is another certifier.
+    assert judged(path, stages=("others",), certifiers={"C-G": WEAK}).mujoco_c_outcomes is None
+    assert "faults_mujoco_c" not in numbers_in(path)
+
+
+def test_mujoco_c_crosses_faults_alone_and_no_soft_ground(path):
+    judged(path, certifiers={"S": WEAK})  # which crosses nothing
+    with pytest.raises(ValueError, match=r"stages .* no faults"):
+        judged(path, Robots(cross_by_genes, stop_after=0), stages=("mujoco_c",))
+    soft = SimpleNamespace(search=SimpleNamespace(space=get_space("super_gaussian+softness")))
+    with pytest.raises(ValueError, match="softness"):
+        InMujocoC().check(read_archive(path), soft, ())
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):

@@ -107,6 +107,33 @@ def test_significant_are_those_of_the_worse_physics_whose_share_of_luck_is_held(
     assert pick_numbers(archive, "faults_panel", "faults_fdr") == (4, 3)
 
 
+def test_faults_that_hold_in_mujoco_c_are_a_share_of_those_tried():
+    archive = judged_archive().rows(np.zeros(5, np.int64))  # the fault, five times; the last is not tried
+    fails, crosses, never = [0, 6, 0, 0], [5, 0, 0, 0], [0, 0, 0, 0]
+    others = np.zeros((5, 2, 4), np.int64)
+    others[[0, 1, 2], 1], others[3, 0] = [crosses, crosses, [5, 1, 2, 0]], crosses  # C-G has no certificate
+    outcomes = np.array([fails, fails, [2, 5, 1, 0], [0, 6, 0, 0], never])
+    archive = replace(archive, mujoco_c_outcomes=outcomes, certifier_mujoco_c_outcomes=others)
+    (numbers,) = pick_numbers(replace(archive, family=np.array([4, 2, 3, 0, 1])), "faults_mujoco_c")
+    # Wilson, 3 of 4: (.75 + 3.842 / 8) / (1 + 3.842 / 4) = .6275, 1.96 sqrt(.75 .25 / 4 + 3.842 / 64) / 1.9604 = .3269
+    assert (numbers["tried"], numbers["hold"]) == (4, 3)
+    assert numbers["interval"] == pytest.approx([0.3006, 0.9544], abs=1e-4)
+    # Of three families, resamples draw the one that does not hold alone, or never, once in 27.
+    (kin,) = pick_numbers(replace(archive, family=np.array([4, 4, 3, 0, 1])), "faults_mujoco_c")
+    assert kin["interval"] == [0.0, 1.0]
+    for family in (np.zeros(5, np.int64), None):
+        assert pick_numbers(replace(archive, family=family), "faults_mujoco_c")[0]["interval"] is None
+    # Elites 0, 3 and 4 are strong faults: 1 of 20 by the controller and 19 of 20 by S. The first of them holds.
+    resolved, crossed = archive.resolved_outcomes.copy(), archive.certifier_outcomes.copy()
+    resolved[[0, 3, 4]], crossed[[0, 3, 4], 1] = [1, 19, 0, 0], [19, 1, 0, 0]
+    outcomes = {"resolved_outcomes": resolved, "certifier_outcomes": crossed, "certifier_resolved_outcomes": crossed}
+    (strong,) = pick_numbers(replace(archive, **outcomes), "faults_mujoco_c")
+    assert (strong["strong"]["tried"], strong["strong"]["hold"]) == (2, 1) and numbers["strong"]["tried"] == 0
+    sentences = [describe_judgement(archive, number)[-1] for number in range(5)]
+    assert [text.endswith("one, too.") for text in sentences] == [True, True, True, False, False]
+    assert [text.endswith("is none.") for text in sentences] == [False, False, False, True, False]
+
+
 def test_numbers_of_what_nobody_looked_at_are_none():
     archive, names = judged_archive(), ("failing", "certified", "confirmed", "faults_panel")
     assert pick_numbers(small_archive(), *names) == (None,) * 4
