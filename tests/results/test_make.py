@@ -15,7 +15,7 @@ import pytest
 from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.search import loop
 from qd.workers import crosser
-from results.make import bare, common, docs, speed, tables
+from results.make import agreement, bare, common, docs, speed, tables
 from sim.files.provenance import sources_sha256
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
@@ -196,6 +196,15 @@ def test_bias_and_distance_are_of_terrains_that_both_have():
     assert common.agreement(OURS, THEIRS, seed=0, families=np.zeros(4, np.int64))["goal_bias_interval"] is None
     numbers = common.agreement(OURS[2:], THEIRS[2:], seed=0)
     assert numbers.pop("terrains") == 0 and set(numbers.values()) == {None}
+
+
+def test_agreement_with_mujoco_c_has_the_difference_of_each_terrain_crossed_there():
+    outcome = {"search": OURS, "again": OURS, "resolved": OURS[[1, 0, 2, 3]], "mujoco_c": THEIRS[:3]}
+    numbers = agreement.compare(outcome, np.arange(4), 0)
+    # Goal .5, 0 and invalid, resolved 0, .5 and invalid, against .25, .25 and 1
+    assert numbers["mujoco_c"]["goal_differences"] == [0.25, -0.25, None]
+    assert numbers["both_resolved"]["goal_differences"] == [-0.25, 0.25, None]
+    assert [numbers[name]["terrains"] for name in ("again", "mujoco_c")] == [3, 2]
 
 
 def test_differences_are_of_the_later_kind_minus_the_earlier():
