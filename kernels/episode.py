@@ -31,6 +31,12 @@ class Invalidity(IntEnum):
     OVERFLOW = 4
 
 
+SEGMENTS = 12
+"""Segments of equal length that the way of a steered episode has."""
+STEERING = ("speed", "offset", "heading")
+"""Of a segment: speed [m/s], offset of the way to the left of the straight line [m], heading left of the way [rad]."""
+LOOKAHEAD = wp.constant(1.0)
+"""Distance ahead of the place that a steered robot is sent to [m]."""
 PARKING_HEIGHT = wp.constant(50.0)
 """Height at which robots whose episodes have ended are kept [m]."""
 
@@ -39,6 +45,8 @@ PARKING_HEIGHT = wp.constant(50.0)
 class Task:
     """Goal, command and limits of an episode; steps are the judged ones."""
 
+    start: wp.vec2
+    """Where the straight line to the goal begins, world-local [m]."""
     goal: wp.vec2
     goal_radius: float
     """The episode ends within this distance of the goal [m]; 0 for never."""
@@ -48,6 +56,9 @@ class Task:
     """Commanded yaw rate per heading error [1/s]."""
     max_yaw_rate: float
     """Largest commanded yaw rate [rad/s]."""
+    lowest_command: wp.vec3
+    """Least command of a steered episode: v_x, v_y [m/s], yaw rate [rad/s]."""
+    highest_command: wp.vec3
     lower: wp.vec2
     """World-local corner of the allowed area [m]; leaving it ends the episode as OUT."""
     upper: wp.vec2
@@ -81,6 +92,8 @@ class Episodes:
     """Largest contact force on the base since the episode was last judged [N]."""
     start: wp.array[wp.vec2]
     """Where the episode began, world-local [m]."""
+    deviation: wp.array[float]
+    """Largest distance so far from the straight line of the task [m]."""
     final_pose: wp.array[wp.transform]
     """Base pose at the end, world-local frame."""
     rng: wp.array[wp.uint32]
@@ -101,6 +114,7 @@ def begin_episode(env: int, episodes_out: Episodes):
     episodes_out.steps[env] = 0
     episodes_out.counted[env] = 0
     episodes_out.base_force[env] = 0.0
+    episodes_out.deviation[env] = 0.0
     episodes_out.final_pose[env] = wp.transform_identity()
 
 
@@ -124,6 +138,27 @@ def goal_command(position: wp.vec2, yaw: float, task: Task) -> wp.vec3:
     )
 
 
+@wp.func
+def steered_command(position: wp.vec2, yaw: float, steering: wp.array3d[float], episode: int, task: Task) -> wp.vec3:
+    """Command by the segment reached: pure pursuit of a place ahead on the segment's offset, and in the end the goal.
+
+    Coulter 1992, "Implementation of the Pure Pursuit Path Tracking Algorithm", with velocities in place of an arc.
+    """
+    line = task.goal - task.start
+    length = wp.length(line)
+    along = line / length
+    reached = wp.dot(position - task.start, along)
+    k = wp.clamp(int(wp.floor(reached / length * float(steering.shape[1]))), 0, steering.shape[1] - 1)
+    place = task.goal
+    if reached + LOOKAHEAD < length:
+        place = task.start + (reached + LOOKAHEAD) * along + steering[episode, k, 1] * wp.vec2(-along[1], along[0])
+    error = wrap_angle(wp.atan2(place[1] - position[1], place[0] - position[0]) - yaw)
+    speed = steering[episode, k, 0]
+    turn = task.yaw_gain * wrap_angle(error + steering[episode, k, 2])
+    command = wp.vec3(speed * wp.cos(error), speed * wp.sin(error), turn)
+    return wp.max(task.lowest_command, wp.min(task.highest_command, command))
+
+
 @kernel_over("outcome")
 def command_goal(joint_q: wp.array2d[float], outcome: wp.array[int], task: Task, command_out: wp.array2d[float]):
     """Grid (num_envs,): write each environment's command, zero once its episode has ended."""
@@ -133,6 +168,38 @@ def command_goal(joint_q: wp.array2d[float], outcome: wp.array[int], task: Task,
         command = goal_command(wp.vec2(joint_q[env, 0], joint_q[env, 1]), base_yaw(joint_q, env), task)
     for k in range(3):
         command_out[env, k] = command[k]
+
+
+@kernel_over("outcome")
+def command_steered(
+    joint_q: wp.array2d[float],
+    outcome: wp.array[int],
+    steering: wp.array3d[float],
+    episode_of_env: wp.array[int],
+    task: Task,
+    command_out: wp.array2d[float],
+):
+    """Grid (num_envs,): replace the commands of running episodes that are steered, whose ``steering`` is not NaN.
+
+    ``steering`` has a row an episode, shape (num_episodes, num_segments, 3): :data:`STEERING`.
+    """
+    env = wp.tid()
+    episode = episode_of_env[env]
+    if episode < 0 or outcome[env] != Outcome.RUNNING:
+        return
+    if wp.isnan(steering[episode, 0, 0]):
+        return
+    position = wp.vec2(joint_q[env, 0], joint_q[env, 1])
+    command = steered_command(position, base_yaw(joint_q, env), steering, episode, task)
+    for k in range(3):
+        command_out[env, k] = command[k]
+
+
+@wp.func
+def distance_from_line(joint_q: wp.array2d[float], env: int, task: Task) -> float:
+    """Distance of the base from the straight line through start and goal [m]."""
+    along = wp.normalize(task.goal - task.start)
+    return wp.abs(along[0] * (joint_q[env, 1] - task.start[1]) - along[1] * (joint_q[env, 0] - task.start[0]))
 
 
 @wp.func
@@ -188,6 +255,7 @@ def latch_outcomes(step: RobotStep, task: Task, episodes_out: Episodes):
     invalidity = find_invalidity(step, task, env)
     outcome = judge_state(step, force, invalidity, steps, task, env)
     episodes_out.base_force[env] = 0.0
+    episodes_out.deviation[env] = wp.max(episodes_out.deviation[env], distance_from_line(step.joint_q, env, task))
     episodes_out.steps[env] = steps
     if outcome != Outcome.INVALID and steps >= task.first_counted_step:
         episodes_out.counted[env] = 1

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels.episode import Episodes, Outcome, begin_episode
+from kernels.episode import SEGMENTS, STEERING, Episodes, Outcome, begin_episode
 from kernels.heightfield import Terrain, node_height
 from kernels.launch import kernel_over, make_zeros
 from kernels.observation import Sensors
@@ -51,21 +51,26 @@ class EpisodeQueue:
     """Physics steps up to the end."""
     final_pose: wp.array[wp.transform]
     """Base pose at the end, world-local frame."""
+    deviation: wp.array[float]
+    """Largest distance from the straight line [m]."""
     penalty_sums: wp.array2d[float]
     """Columns :data:`kernels.penalties.PENALTIES`, times the physics step."""
     reward: wp.array[float]
     """Reward of the whole time; empty where nothing is rewarded."""
+    steering: wp.array3d[float]
+    """Way of each episode, shape (num_slots * num_replicas, SEGMENTS, 3); empty where none is steered."""
 
 
 def make_queue(
-    num_envs: int, num_slots: int, num_replicas: int, num_penalties: int, *, rewarded: bool, device: str
+    num_envs: int, num_slots: int, num_replicas: int, num_penalties: int, *, rewarded: bool, steered: bool, device: str
 ) -> EpisodeQueue:
     """Allocate an empty queue for ``num_slots`` terrains at once; ``rewarded`` queues keep rewards too."""
     rows = num_slots * num_replicas
     shapes = {"taken": 1, "ready": 1, "penalty_sums": (rows, num_penalties), "reward": rows if rewarded else 0}
+    shapes["steering"] = (rows if steered else 0, SEGMENTS, len(STEERING))
     shapes |= dict.fromkeys(("seed", "num_ended"), num_slots)
     shapes |= dict.fromkeys(("episode_of_env", "begins", "busy"), num_envs)
-    shapes |= dict.fromkeys(("outcome", "invalidity", "steps", "final_pose"), rows)
+    shapes |= dict.fromkeys(("outcome", "invalidity", "steps", "final_pose", "deviation"), rows)
     queue = make_zeros(EpisodeQueue, device, **shapes)
     queue.num_replicas = num_replicas
     queue.episode_of_env.fill_(-1)
@@ -107,6 +112,7 @@ def turn_over(
         queue_out.invalidity[row] = episodes_out.invalidity[env]
         queue_out.steps[row] = episodes_out.steps[env]
         queue_out.final_pose[row] = episodes_out.final_pose[env]
+        queue_out.deviation[row] = episodes_out.deviation[env]
         for k in range(penalty_sums_out.shape[1]):
             queue_out.penalty_sums[row, k] = penalty_sums_out[env, k]
         if queue_out.reward.shape[0] > 0:

@@ -171,16 +171,20 @@ class JudgeCommand(_RunFlags):
     if under half of the robots reach the goal. resolved: those that fail are crossed in 20 episodes with contact
     resolved, 1 ms steps and a contact time constant of 3 ms. An elite that fails there too is confirmed. others: other
     controllers cross those that fail, at the search's settings and with contact resolved. An elite is certified if one
-    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. varied: faults
-    are crossed again under 20 draws of moderate conditions, payload, motor strength, delay, noise and friction. A fault
-    is robust if the controller still crosses under half of them, and another at least half. mujoco_c: 150 faults at
-    random, one a family first, are crossed in MuJoCo C with steps of 1 ms, in 6 episodes, or 10 if these do not
-    decide whether half of 10 reach the goal. A fault holds there if the controller crosses under half, and its best
-    certifier at least half. Crossings are kept, so the same command goes on after Ctrl-C.
+    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. steered: of what
+    nobody crosses, ways are sought by which the controller itself, or else another, does: slower, or a little aside.
+    One that is never more than 0.5 m from the straight line certifies, too. varied: faults are crossed again under 20
+    draws of moderate conditions, payload, motor strength, delay, noise and friction. A fault is robust if the
+    controller still crosses under half of them, and another at least half. mujoco_c: 150 faults at random, one a family
+    first, are crossed in MuJoCo C with steps of 1 ms, in 6 episodes, or 10 if these do not decide whether half of 10
+    reach the goal. A fault holds there if the controller crosses under half, and its best certifier at least half.
+    Crossings are kept, so the same command goes on after Ctrl-C.
     """
 
     stages: tuple[str, ...] = ("fresh", "resolved", "others")
-    """Some of fresh, resolved, others, varied, mujoco_c, in the order in which to do them."""
+    """Some of fresh, resolved, others, steered, varied, mujoco_c, in the order in which to do them."""
+    steered: PositiveInt | None = None
+    """Terrains for which steered seeks ways at most; 20 on the CPU and all on a GPU if left out."""
     skip_level_ground: bool = False
     """Judge though the controller of a robot of yours does not cross level ground."""
 
@@ -195,7 +199,8 @@ class JudgeCommand(_RunFlags):
         if not self.skip_level_ground:
             searched = find_search(run, robot=self.robot, policy=self.policy, space=self.space)
             report_level_ground(searched.robot, searched.policy, named["compute"], must_walk=True)
-        archive = judge(run, stages=self.stages, **named)
+        most = self.steered or (None if named["compute"].on_gpu else 20)
+        archive = judge(run, stages=self.stages, most_steered=most, **named)
         print_summary(run, archive, robot=self.robot, policy=self.policy, space=self.space)
 
 

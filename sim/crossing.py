@@ -34,6 +34,9 @@ class CrossingCfg:
     goal_radius: float = 0.5
     yaw_gain: float = 0.5
     max_yaw_rate: float = 1.0
+    lowest_command: tuple[float, float, float] = (0.0, -0.5, -1.0)
+    """Least command of a steered episode: v_x, v_y [m/s], yaw rate [rad/s]."""
+    highest_command: tuple[float, float, float] = (1.0, 0.5, 1.0)
     lower: tuple[float, float] = (-2.0, -2.0)
     upper: tuple[float, float] = (18.0, 10.0)
     penalties_from_s: float = 0.0

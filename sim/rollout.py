@@ -11,7 +11,15 @@ import numpy as np
 import torch
 import warp as wp
 
-from kernels.episode import Outcome, begin_episodes, command_goal, latch_outcomes, make_episodes, park_ended
+from kernels.episode import (
+    Outcome,
+    begin_episodes,
+    command_goal,
+    command_steered,
+    latch_outcomes,
+    make_episodes,
+    park_ended,
+)
 from kernels.observation import apply_action
 from kernels.penalties import PENALTIES, add_penalties, penalty_columns
 from kernels.queue import make_queue, make_ready, ring_slices, turn_over
@@ -45,6 +53,8 @@ class RolloutResult:
     """Simulated time up to the end [s], float32."""
     final_position: np.ndarray
     """Base position at the end, world-local [m], (T, R, 3) float32."""
+    deviation: np.ndarray
+    """Largest distance of the base from the straight line between start and goal [m], float32."""
     physics_steps: int = 0
     """Physics steps run for it: since the result before, or since it was put in if nothing else was."""
     robot_steps: int = 0
@@ -151,13 +161,14 @@ class Rollout:
         space: TerrainSpace = SUPER_GAUSSIAN,
         with_ground: bool = False,
         with_conditions: bool = False,
+        with_steering: bool = False,
     ) -> None:
         """Load the policy, build the simulation and capture the control step.
 
         The policy is a file, ``module:callable`` or a callable on device tensors. ``num_terrains`` may be under way at
         once, with ``replicas`` episodes on each, run by ``num_envs`` robots: one an episode if None, and never
         more. Heights may come with maps of the ground if ``with_ground``, and with conditions if ``with_conditions``;
-        with genes the space decides.
+        with genes the space decides. ``with_steering`` they may have ways of their episodes.
         """
         if num_terrains < 1 or replicas < 1 or (num_envs is not None and num_envs < 1):
             raise ValueError(
@@ -176,7 +187,7 @@ class Rollout:
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         try:
             bank = TerrainBank(num_terrains, device=device, with_ground=with_ground, with_conditions=with_conditions)
-            self._build(bank, loaded, solver)
+            self._build(bank, loaded, solver, steered=with_steering)
         except (MemoryError, RuntimeError) as error:  # those of Warp have no type of their own
             failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
             if not failed and not str(error).startswith("Failed to allocate"):
@@ -186,7 +197,7 @@ class Rollout:
                 f"and {num_terrains:,} terrains at once: give fewer"
             ) from error
 
-    def _build(self, bank: TerrainBank, policy: Policy, solver: SolverCfg | None) -> None:
+    def _build(self, bank: TerrainBank, policy: Policy, solver: SolverCfg | None, *, steered: bool) -> None:
         from sim.simulation import Reward, Simulation  # Newton takes seconds to load: only what simulates loads it
 
         robot = self.robot
@@ -208,8 +219,9 @@ class Rollout:
             self._counter = wp.zeros(1, dtype=int)
             self.penalty_sums = wp.zeros((num_envs, len(PENALTIES)), dtype=float)
             self._queue = make_queue(
-                num_envs, self.num_terrains, self.replicas, len(PENALTIES), rewarded=self.cfg.reward, device=bank.device
-            )
+                num_envs, self.num_terrains, self.replicas, len(PENALTIES),
+                rewarded=self.cfg.reward, steered=steered, device=bank.device,
+            )  # fmt: skip
             self.episode = self._queue.episode_of_env
             self._ranges = make_start_ranges(self.cfg, robot)
             self._robot_step = sim.make_step(self.command, self._last_action)
@@ -254,6 +266,9 @@ class Rollout:
             begin_episodes(queue.begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
         command_goal(sim.joint_q, episode.outcome, self._task, self.command)
+        if queue.steering.shape[0]:
+            steered = (queue.steering, queue.episode_of_env)
+            command_steered(sim.joint_q, episode.outcome, *steered, self._task, self.command)
         sim.observe(self._robot_step, episode, self.robot.physics_dt, None, self._counter, self._observation)
 
     @property
@@ -292,6 +307,9 @@ class Rollout:
         spaces = [space_key(space.name, space.sha256) for space in (terrains.space, self.space)]
         if terrains.genes is not None and spaces[0] != spaces[1]:
             raise ValueError(f"genes must be of the space {self.space.name} here, got {terrains.space.name}")
+        num_ways = 0 if terrains.steering is None else terrains.steering.shape[1]
+        if num_ways != (self.replicas if self._queue.steering.shape[0] else 0):
+            raise ValueError(f"terrains must have {self.replicas} ways each if with_steering, else 0, got {num_ways}")
         slots = ring_slices(0 if idle else self._next_slot, count, self.num_terrains)
         written = 0
         with wp.ScopedDevice(self.sim.device):
@@ -300,6 +318,9 @@ class Rollout:
                 self.sim.bank.set(lot, run)
                 self._queue.seed[run].assign(lot.seeds.astype(np.uint32))
                 self._queue.num_ended[run].zero_()
+                if lot.steering is not None:
+                    rows = slice(run.start * self.replicas, run.stop * self.replicas)
+                    self._queue.steering[rows].assign(lot.steering.reshape(-1, *lot.steering.shape[2:]))
                 written += len(lot)
         num_episodes = count * self.replicas
         max_steps = self._max_episode_steps * -(-num_episodes // self.num_envs)
@@ -408,6 +429,7 @@ class Rollout:
             fallen=upright < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
             duration_s=(read(queue.steps) * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],
+            deviation=read(queue.deviation),
             physics_steps=physics_steps,
             robot_steps=physics_steps * self.num_envs,
             busy_steps=busy_steps,

@@ -364,7 +364,7 @@ def find_candidates(archive: Archive, search: Search) -> tuple[list[tuple[Entry,
 
     verdicts = find_verdicts(archive)
     for number in near.tolist():
-        if archive.certified[number] or rate[number] >= FAILING_GOAL_RATE:
+        if archive.certified_by_controllers[number] or rate[number] >= FAILING_GOAL_RATE:
             numbers = {"searched": rate_numbers(fresh_counts(archive, number)), **judgement(archive, number)}
             add(number, None, archive.genes[number], VERDICTS[verdicts[number]], **numbers)
         else:

@@ -86,7 +86,7 @@ class TerrainSet:
     @property
     def certified(self) -> NDArray[np.bool_] | None:
         """Whether another controller crosses each elite that the searched one fails, shape (T,); None if unknown."""
-        return self.elites.certified if self.elites is not None and self.elites.certifiers else None
+        return self.elites.certified_by_controllers if self.elites is not None and self.elites.certifiers else None
 
     def rows(self, chosen: NDArray[np.int64]) -> "TerrainSet":
         """Some of the terrains alone."""

@@ -150,7 +150,7 @@ def _count_certified(
         roles |= {hashes[certifier]: "certifier" for certifier, count in certifiers.items() if count}
         roles.pop(None, None)
         certified[name] = {
-            "terrains": int(elites.certified.sum()),
+            "terrains": int(elites.certified_by_controllers.sum()),
             "certifiers": certifiers,
             "chosen_by": {
                 name: roles[about["sha256"]] for name, about in controllers.items() if about["sha256"] in roles

@@ -295,6 +295,8 @@ def summarise_search(ranking: Ranking, archive: Archive) -> str:
     failing = int(ranking.failing.sum())
     commonest = next(iter(ranking.by_cause()), UNCLEAR)
     cause = describe_commonest(commonest) if failing > 1 else f"cause: {commonest}"
-    judged = {"asked": failing and archive.certifiers, "certified": archive.certified.sum()}
+    asked = failing and (archive.certifiers or archive.witnesses is not None)
+    judged = {"asked": asked, "certified": archive.certified.sum()}
+    judged["steered"] = (archive.is_fault & ~archive.certified_by_controllers).sum()
     counts = {"count": len(ranking), "failing": failing, "faults": count_faults(archive), **judged}
     return TEMPLATES.get_template("summary.txt").render(cause="" if commonest == UNCLEAR else cause, **counts)

@@ -15,16 +15,19 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.evaluate.sets import plain_set
 from qd.faults.families import find_failing_causes, find_families, judged_numbers
 from qd.faults.numbers import (
     EPISODES,
     FRESH_EPISODES,
     FURTHER_NUMBERS,
+    SEARCHED,
     best_certifier,
     found_numbers,
     fresh_numbers,
 )
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
+from qd.faults.steer import SteerCfg, measure_line, no_witnesses, seek_witnesses
 from qd.search.archive import (
     ARCHIVE_FILE,
     NO_FURTHER_OUTCOMES,
@@ -45,8 +48,14 @@ from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.mujoco_c.model import NO_SOFTNESS
 from sim.rollout import RolloutResult
+from sim.terrains.spaces.base import MAX_HEIGHT
+from sim.terrains.spaces.registry import at_height
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import varied_genes, varied_space
 from sim.terrains.terrains import Terrains
+
+_LINE_TERRAINS = 100  # that show how far plain crossings are from the straight line
+_WITNESS_WORDS = {3: "on the line", 2: "beside it", 1: "around"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +65,8 @@ class Judging:
     search: Search
     certifiers: Mapping[str, str]
     crosser: Crosser
+    most_steered: int | None = None
+    """Terrains for which the stage ``steered`` looks for witnesses at most."""
     step: str = ""
     """What bars say before their label."""
 
@@ -207,6 +218,38 @@ class Others(Stage):
         return archive
 
 
+class Steered(Stage):
+    """Looks for ways by which the searched controller, or else a certifier, crosses what nobody crosses without."""
+
+    name = "steered"
+    asks_certifiers = True
+
+    def run(self, archive: Archive, judging: Judging) -> Archive:
+        """The archive with witnesses of its confirmed elites that no controller certifies, the hardest first."""
+        search, crosser = judging.search, judging.crosser
+        open_cases = archive.confirmed if archive.resolved_outcomes.any() else archive.failing
+        rows = np.flatnonzero(open_cases & ~archive.certified_by_controllers)[: judging.most_steered]
+        crossed = {*zip(archive.certifiers, archive.certifier_sha256, strict=True)}
+        walkers = {SEARCHED: search.policy}
+        walkers |= {name: f for name, f in judging.certifiers.items() if (name, controller_hash(f)) in crossed}
+        cfg = SteerCfg()
+        terrains = judging.elite_terrains(archive, rows, Stream.STEERED)
+        times = len(walkers) * cfg.seeds
+        seeds = elite_seeds(archive, search.cfg.seed, times, stream=Stream.STEERED).reshape(-1, times)[rows]
+        level = at_height(SUPER_GAUSSIAN, MAX_HEIGHT * search.space.height_share)
+        plain = plain_set("hard_random", _LINE_TERRAINS, search.cfg.seed, level).terrains
+        limit_m = measure_line(crosser, search.policy, plain)
+        rng = np.random.default_rng([search.cfg.seed, Stream.STEERED])
+        some = seek_witnesses(crosser, walkers, terrains, seeds, limit_m, rng=rng, label=judging.step, cfg=cfg)
+        witnesses = no_witnesses(len(archive), limit_m)
+        for name, values in vars(some).items():
+            if isinstance(values, np.ndarray):
+                getattr(witnesses, name)[rows] = values
+        found = [f"{(some.kind == kind).sum()} {words}" for kind, words in _WITNESS_WORDS.items()]
+        print(f"Witnesses on {len(rows)} terrains that no other controller crosses: {', '.join(found)}.", flush=True)
+        return replace(archive, witnesses=witnesses)
+
+
 class OfFaults(Stage):
     """A stage in which the controller and certifiers cross faults again."""
 
@@ -251,7 +294,7 @@ class Varied(OfFaults):
         """The archive with outcomes of all controllers under the same conditions."""
         self._check_certifiers(archive, judging)
         search = judging.search
-        rows = np.flatnonzero(archive.is_fault)
+        rows = np.flatnonzero(archive.confirmed & archive.certified_by_controllers)
         space = varied_space(search.space)
         seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)[rows]
         drawn = [varied_genes(search.space, archive.genes[row], draws) for row, draws in zip(rows, seeds, strict=True)]
@@ -342,7 +385,8 @@ def is_decided(counts: NDArray[np.int64], episodes: int) -> NDArray[np.bool_]:
     return ((lead >= rest) | (lead < -rest)) & ~np.isnan(goal_rates(counts))
 
 
-STAGES: dict[str, Stage] = {stage.name: stage for stage in (Fresh(), Resolved(), Others(), Varied(), InMujocoC())}
+_ALL = (Fresh(), Resolved(), Others(), Steered(), Varied(), InMujocoC())
+STAGES: dict[str, Stage] = {stage.name: stage for stage in _ALL}
 
 
 def judge(
@@ -354,6 +398,7 @@ def judge(
     robot: str | None = None,
     policy: str | None = None,
     space: str | None = None,
+    most_steered: int | None = None,
 ) -> Archive:
     """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
@@ -371,7 +416,8 @@ def judge(
         if archive.fresh is not None and archive.family is None:
             archive = with_families(archive, search)
         for number, name in enumerate(stages, 1):
-            archive = STAGES[name].run(archive, replace(judging, step=f"{number} of {len(stages)}: "))
+            step = f"{number} of {len(stages)}: "
+            archive = STAGES[name].run(archive, replace(judging, step=step, most_steered=most_steered))
             _write(archive, judging, name)
     return archive
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import false_discovery_control, hypergeom
 
-from qd.search.archive import OUTCOMES, Archive, FreshValues, goal_rates
+from qd.search.archive import OUTCOMES, WITNESSES, Archive, FreshValues, goal_rates
 from qd.search.fitness import FITNESS_FLOOR
+from sim.crossing import CrossingCfg
 from sim.files.atomic import read_json
 from sim.files.intervals import RATES, bootstrap_interval, format_rate, format_value, wilson_interval
 from sim.files.npz import read_arrays
@@ -27,15 +28,18 @@ FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""
 EPISODES = 20
 """Episodes of an elite in each further stage of judging."""
+SEARCHED = "searched"
+"""Name of the searched controller among those that are steered."""
 SPECIALIST = "specialist"
 """Name of the certifier that was trained for one search, on its failing elites; all others form the panel."""
 
 TEMPLATES = open_templates(Path(__file__).parent / "templates")
 """Texts about elites."""
 _INVALID = OUTCOMES.index("invalid")
-_FALSE_DISCOVERIES = 0.05  # share of them among what is significant
+MAX_FALSE_DISCOVERIES = 0.05
+"""Largest expected share of luck among what is significant (Benjamini and Hochberg 1995)."""
 _KINDS = {"searched": "", "resolved": " with contact resolved", "varied": " under varied conditions"}
-FURTHER_NUMBERS = ("crossed_varied", "robust", "faults_mujoco_c")
+FURTHER_NUMBERS = ("witnesses", "crossed_varied", "robust", "faults_mujoco_c")
 """Numbers of :func:`fault_numbers` that an archive has only if its faults were crossed again."""
 MINIMAL_FILE = "minimal.npz"
 MINIMAL_NUMBERS_FILE = "minimal.json"
@@ -83,7 +87,8 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
     """The numbers of faults, as ``archive.json`` has them; None where nobody knows."""
     failing, families = archive.failing, archive.family
     names = archive.certifiers
-    counts = ("confirmed", "certified", "faults", "faults_panel", "fault_families", "strong", "faults_fdr")
+    parts = ("faults", "faults_panel", "faults_controllers", "faults_witness")
+    counts = ("confirmed", "certified", *parts, "fault_families", "strong", "faults_fdr")
     numbers: dict[str, Any] = {
         "failing": None if archive.fresh is None else int(failing.sum()),
         **dict.fromkeys(counts, 0 if archive.fresh is not None and not failing.any() else None),
@@ -107,15 +112,21 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
     ]
     if resolved.any():
         numbers["confirmed"] = int(archive.confirmed.sum())
-    if names:
-        numbers["certified"] = int(certificates.any(axis=1).sum())
-    if names and resolved.any():
-        in_panel = np.array(names) != SPECIALIST
-        is_fault = archive.is_fault
-        numbers["faults"] = None if in_panel.all() else int(is_fault.sum())
+    if (witnesses := archive.witnesses) is not None:
+        tried = witnesses.walker != ""
+        found = {name: int((witnesses.kind == kind).sum()) for kind, name in enumerate(WITNESSES) if name}
+        numbers["witnesses"] = {"tried": int(tried.sum()), **found, "limit_m": witnesses.limit_m}
+    if names or witnesses is not None:
+        numbers["certified"] = int(archive.certified.sum())
+    if (names or witnesses is not None) and resolved.any():
+        in_panel = np.array(names, np.str_) != SPECIALIST
+        is_fault, by_controllers = archive.is_fault, archive.certified_by_controllers
+        numbers["faults"] = None if in_panel.all() and witnesses is None else int(is_fault.sum())
         numbers["faults_panel"] = int((is_fault & certificates[:, in_panel].any(axis=1)).sum())
+        numbers["faults_controllers"] = int((is_fault & by_controllers).sum())
+        numbers["faults_witness"] = None if witnesses is None else int((is_fault & ~by_controllers).sum())
         numbers["strong"] = int(archive.strong.sum())
-        numbers["faults_fdr"] = int((archive.confirmed & find_significant(archive)).sum())
+        numbers["faults_fdr"] = int((is_fault & find_significant(archive)).sum())
         if families is not None:
             numbers["fault_families"] = len(np.unique(families[is_fault]))
         if archive.varied_outcomes is not None:
@@ -136,19 +147,21 @@ def find_significant(archive: Archive) -> NDArray[np.bool_]:
     holds the share of false discoveries among the failing elites at 5 %.
     """
     both = np.stack([archive.certifier_outcomes, archive.certifier_resolved_outcomes])
-    worse = fisher_p(both, archive.resolved_outcomes[:, None]).max(axis=0)
+    others = archive.resolved_outcomes[:, None]
+    valid, other_valid = (counts.sum(axis=-1) - counts[..., _INVALID] for counts in (both, others))
+    known = ~np.isnan(goal_rates(both) + goal_rates(others))
+    worse = np.where(known, fisher_p(both[..., 0], valid, others[..., 0], other_valid), 1.0).max(axis=0)
     p = (worse * len(archive.certifiers)).min(axis=1, initial=1.0)
     significant = archive.failing
-    significant[significant] = false_discovery_control(p[significant]) <= _FALSE_DISCOVERIES
+    significant[significant] = false_discovery_control(p[significant]) <= MAX_FALSE_DISCOVERIES
     return significant
 
 
-def fisher_p(counts: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
-    """One-sided p that episodes ``counts``, shape (..., 4), reach the goal more often than ``others``; 1 if unknown."""
-    goals, other_goals = counts[..., 0], others[..., 0]
-    valid, other_valid = (ends.sum(axis=-1) - ends[..., _INVALID] for ends in (counts, others))
-    p = hypergeom.sf(goals - 1, valid + other_valid, goals + other_goals, valid)
-    return np.where(np.isnan(goal_rates(counts) + goal_rates(others)), 1.0, p)
+def fisher_p(
+    goals: NDArray[np.int64], valid: NDArray[np.int64], other_goals: NDArray[np.int64], other_valid: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """One-sided p (Fisher's exact test) that episodes reach the goal more often than others, of counts; 1 of none."""
+    return np.nan_to_num(hypergeom.sf(goals - 1, valid + other_valid, goals + other_goals, valid), nan=1.0)
 
 
 def _share_held(archive: Archive, tried: NDArray[np.bool_]) -> dict[str, Any]:
@@ -203,7 +216,33 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
     crossers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
     known = {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
     known["in_mujoco_c"] = archive.mujoco_c_outcomes is not None and archive.mujoco_c_outcomes[number].any()
+    known["on_line"] = archive.witnesses is not None and archive.witnesses.on_line[number]
+    known["witness"] = describe_witness(archive, number)
     return TEMPLATES.get_template("elite.txt").render(rates=rates, crossers=crossers, **known).splitlines()
+
+
+def describe_witness(archive: Archive, number: int) -> str:
+    """How a controller crosses an elite where it is steered, in a sentence; empty where no such way is known."""
+    witnesses = archive.witnesses
+    if witnesses is None or not (kind := WITNESSES[witnesses.kind[number]]):
+        return ""
+    column = len(WITNESSES) - 1 - int(witnesses.kind[number])
+    goals, valid = witnesses.counts[number, 0, 1, [column, -1]].tolist()
+    walker = str(witnesses.walker[number])
+    about = {"kind": kind, "goals": goals, "valid": valid, "walker": "" if walker == SEARCHED else walker}
+    return TEMPLATES.get_template("witness.txt").render(way=describe_way(witnesses.way[number]), **about)
+
+
+def describe_way(way: NDArray[np.float32]) -> str:
+    """What a way tells a robot to do, in words: how fast, slowest where, and where furthest from the straight line."""
+    ends = np.linspace(CrossingCfg.start[0], CrossingCfg.goal[0], len(way) + 1)
+    speed, offset = way[:, 0], way[:, 1]
+    slow, aside = int(speed.argmin()), int(np.abs(offset).argmax())
+    places = [f"from x = {ends[k]:.0f} to {ends[k + 1]:.0f} m" for k in (slow, aside)]
+    is_even = speed.max() - speed.min() < 0.15
+    words = f"at {speed.mean():.1f} m/s" if is_even else f"slowed to {speed[slow]:.1f} m/s {places[0]}"
+    side = f"{abs(offset[aside]):.1f} m to the {'left' if offset[aside] > 0 else 'right'} {places[1]}"
+    return f"{words} and {side}" if abs(offset[aside]) >= 0.05 else words
 
 
 def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.episode import STEERING
 from qd.search.descriptors import Cells
 from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
@@ -34,6 +35,38 @@ class FreshValues(Evaluation):
         valid = np.flatnonzero(self.valid & (self.fitness > FITNESS_FLOOR))
         order = valid[np.lexsort((-self.fitness[valid], self.cell[valid]))]
         return order[np.unique(self.cell[order], return_index=True)[1]]
+
+
+WITNESSES = ("", "around", "beside", "line")
+"""Kinds of witnesses, the strictest last: by how far from the straight line the ways lead (:mod:`qd.faults.steer`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Witnesses:
+    """Ways by which a controller crosses some of N elites, if it does (:mod:`qd.faults.steer`)."""
+
+    walker: NDArray[np.str_]
+    """Name of the controller whose way it is, ``searched`` for that of the search; empty where none was tried, (N,)."""
+    kind: NDArray[np.int64]
+    """Index in :data:`WITNESSES`, shape (N,)."""
+    way: NDArray[np.float32]
+    """:data:`kernels.episode.STEERING` by segment, shape (N, SEGMENTS, 3)."""
+    counts: NDArray[np.int64]
+    """Episodes that reach the goal on the line, beside it, and at all, and valid ones; shape (N, 2, 2, 4).
+
+    At the search's settings and with contact resolved, under the plain command and steered."""
+    limit_m: float
+    """Largest distance from the straight line of a way on the line [m]."""
+
+    @property
+    def on_line(self) -> NDArray[np.bool_]:
+        """Whether a witness on the line certifies that an elite can be crossed, shape (N,)."""
+        return self.kind == WITNESSES.index("line")
+
+    def rows(self, chosen: NDArray[Any]) -> "Witnesses":
+        """The ways on some of the elites alone, in the order given."""
+        columns: dict[str, Any] = {name: vars(self)[name][chosen] for name in ("walker", "kind", "way", "counts")}
+        return replace(self, **columns)
 
 
 OUTCOMES = ("goal", "base_collision", "other", "invalid")
@@ -110,6 +143,9 @@ class Archive(Evaluation, Subject):
     """At the search's settings."""
     certifier_resolved_outcomes: NDArray[np.int64]
 
+    witnesses: Witnesses | None = None
+    """None before the stage ``steered``."""
+
     # Under varied conditions (:func:`sim.terrains.spaces.wider.varied_genes`); None before.
     varied_outcomes: NDArray[np.int64] | None = None
     certifier_varied_outcomes: NDArray[np.int64] | None = None
@@ -159,9 +195,15 @@ class Archive(Evaluation, Subject):
         return np.all([goal_rates(counts) >= FAILING_GOAL_RATE for counts in both], axis=0)
 
     @property
-    def certified(self) -> NDArray[np.bool_]:
+    def certified_by_controllers(self) -> NDArray[np.bool_]:
         """Whether it fails an elite that another controller crosses, shape (N,)."""
         return self.failing & self.certificates.any(axis=1)
+
+    @property
+    def certified(self) -> NDArray[np.bool_]:
+        """Whether it fails an elite that another controller crosses, or some controller on the line, shape (N,)."""
+        by_witness = False if self.witnesses is None else self.failing & self.witnesses.on_line
+        return self.certified_by_controllers | by_witness
 
     @property
     def is_fault(self) -> NDArray[np.bool_]:
@@ -206,7 +248,13 @@ class Archive(Evaluation, Subject):
 
     def rows(self, chosen: NDArray[Any]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
-        return replace(super().rows(chosen), fresh=self.fresh and self.fresh.rows(chosen))
+        groups = {name: values and values.rows(chosen) for name, values in self._groups.items()}
+        return replace(super().rows(chosen), **groups)
+
+    @property
+    def _groups(self) -> dict[str, Any]:
+        """Groups of columns that are values of their own, by the field's name."""
+        return {"fresh": self.fresh, "witnesses": self.witnesses}
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with fresh values, by descending corrected fitness, the invalid elites last."""
@@ -230,13 +278,16 @@ _FRESH = {_PREFIX + name: shape for name, shape in {**_VALUES, "reproduced": "N"
 _GROUPED = {"family": "N", "cause": "N"}
 _CERTIFIERS = {"certifiers": "C", "certifier_sha256": "C"}
 _CROSSED = {**_CERTIFIERS, "resolved_outcomes": "N4", "certifier_outcomes": "NC4", "certifier_resolved_outcomes": "NC4"}
+_WITNESS = "witness_"
+_STEERED = {f"{_WITNESS}{name}": shape for name, shape in {"walker": "N", "kind": "N", "way": "NS3"}.items()}
+_STEERED |= {f"{_WITNESS}counts": "N224", f"{_WITNESS}limit_m": ""}
 _VARIED = {"varied_outcomes": "N4", "certifier_varied_outcomes": "NC4"}
 _MUJOCO_C = {"mujoco_c_outcomes": "N4", "certifier_mujoco_c_outcomes": "NC4"}
-_BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _VARIED, _MUJOCO_C)  # groups that a file has whole, or not at all
-_TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause"} - {"intervals", "collision_bit", "iterations", "scales"}
+_BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _STEERED, _VARIED, _MUJOCO_C)  # groups that a file has whole, or not at all
+_TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause", "witness_walker"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
 
-NO_FURTHER_OUTCOMES: dict[str, Any] = dict.fromkeys((*_VARIED, *_MUJOCO_C))
+NO_FURTHER_OUTCOMES: dict[str, Any] = dict.fromkeys((*_VARIED, *_MUJOCO_C, "witnesses"))
 """Columns of an archive whose faults nobody has crossed again."""
 
 
@@ -246,6 +297,8 @@ def write_archive(path: Path, archive: Archive) -> None:
     values = {name: getattr(archive, name) for group in groups for name in group}
     if archive.fresh is not None:
         values |= {_PREFIX + name: column for name, column in vars(archive.fresh).items()}
+    if archive.witnesses is not None:
+        values |= {_WITNESS + name: column for name, column in vars(archive.witnesses).items()}
     values |= {name: np.array(values[name], np.str_) for name in _CERTIFIERS if name in values}  # of none, too
     arrays = {name: np.asarray(value) for name, value in values.items() if value is not None}
     if archive.is_judged:
@@ -264,7 +317,7 @@ def read_archive(path: str | Path) -> Archive:
         names = [name for name in (*_SETTINGS, *_FOUND) if name not in _OPTIONAL or name in stored]
         names += [name for group in _BY_JUDGING if not stored.isdisjoint(group) for name in group]
         arrays = read_arrays(file, names)
-        sizes = {"2": 2, "4": len(OUTCOMES)}
+        sizes = {"2": 2, "3": len(STEERING), "4": len(OUTCOMES)}
         check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
         for name, array in arrays.items():
             kinds, content = ("U", "texts") if name in _TEXTS else ("bif", "numbers")
@@ -276,7 +329,9 @@ def read_archive(path: str | Path) -> Archive:
         for name in arrays.keys() & {*_SETTINGS, *_CERTIFIERS}:  # as the dataclass has them
             values[name] = tuple(array.tolist()) if (array := arrays[name]).ndim else array.item()
         fresh = {name.removeprefix(_PREFIX): values.pop(name) for name in _FRESH if name in values}
-        return Archive(**values, fresh=FreshValues(**fresh) if fresh else None)
+        steered = {name.removeprefix(_WITNESS): values.pop(name) for name in _STEERED if name in values}
+        witnesses = Witnesses(**{**steered, "limit_m": float(steered["limit_m"])}) if steered else None
+        return Archive(**values, fresh=FreshValues(**fresh) if fresh else None, witnesses=witnesses)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         message = f"{file} must be the archive of a search, but it is damaged or another file: {error}"
         raise ValueError(message) from None

@@ -85,7 +85,7 @@ class FilmCommand(ReplayCommand):
     """Write a GIF 480 pixels wide, of at most 2 MB."""
     beside: str | None = None
     """Another controller to show as a ghost from the same start: C-G or another name of the robot's panel, or a file,
-    as --policy takes it."""
+    as --policy takes it; or witness, the one that crosses the elite where it is steered (`faultline judge`)."""
     shadows: bool = True
     """Whether the sun casts shadows; without a GPU they take half of the time."""
 

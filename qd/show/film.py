@@ -22,7 +22,7 @@ from qd.faults.numbers import SPECIALIST
 from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, count_rates, find_failure_time, find_typical_episode, get_ending, make_title
-from qd.show.replay import ReplaySource, save
+from qd.show.replay import WITNESS, ReplaySource, save
 from qd.workers.compute import check_policy
 from sim.controllers.spec import SHIPPED, label_suffix, resolve_policy
 from sim.crossing import CrossingCfg
@@ -268,7 +268,8 @@ def film_source(
 ) -> list[Path]:
     """Films of terrains; all is crossed and stored before the first is made.
 
-    ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file;
+    ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file, or
+    ``witness``, the controller that crosses the elite where it is steered;
     ``look`` may have ``whole`` and ``shadows`` of :func:`film`.
     """
     if not gif and out is not None and out.suffix == ".gif":
@@ -278,13 +279,14 @@ def film_source(
     if episode is not None and episode >= replicas:
         raise ValueError(f"episode must be one of 0..{replicas - 1}, got {episode}")
     open_context(64, 64).free()
-    ghost_policy = None if beside is None else find_ghost(source, beside, device)
+    ghost_policy = None if beside in (None, WITNESS) else find_ghost(source, beside, device)
+    requests = source.steered_requests() if beside == WITNESS else source.requests(ghost_policy)
     recordings = source.record(device)
     look |= {"episode": episode, "by": source.by}
-    ghosts = source.record(device, ghost_policy) if beside is not None else []
+    ghosts = source.record(device, requests) if beside is not None else []
     for recording, ghost, file in itertools.zip_longest(recordings, ghosts, files):
         with Bar(f"filming {recording.labels[0]}") as bar:
-            other = None if beside is None else (label_suffix(beside)[1:], ghost)
+            other = None if beside is None else (beside if beside == WITNESS else label_suffix(beside)[1:], ghost)
             film(recording, source.robot, source.scales, file, beside=other, progress=bar.move_to, **look)
     return files
 
@@ -308,6 +310,7 @@ def find_ghost(source: ReplaySource, name: str, device: str) -> str:
                 remedy = f"; the run has no specialist: `{train}` trains one, and {judge}"
         reason = f"got '{name}'" if remedy else str(error)
         raise ValueError(
-            f"beside must be {', '.join([*known, SHIPPED])} or a controller as --policy takes it: {reason}{remedy}"
+            f"beside must be {', '.join([*known, SHIPPED])}, {WITNESS}, or a controller as --policy takes it: "
+            f"{reason}{remedy}"
         ) from error
     return policy

@@ -52,7 +52,7 @@ class CrossingRequest:
     def lot_key(self) -> tuple[Any, ...]:
         """Equal for requests that one simulation crosses side by side."""
         space = self.terrain.space.name
-        maps = (self.terrain.has_ground, self.terrain.has_conditions)
+        maps = (self.terrain.has_ground, self.terrain.has_conditions, self.terrain.steering is not None)
         return self.policy, self.replicas, self.seed, space, self.terrain.values.shape, maps
 
 

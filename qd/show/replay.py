@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
-from qd.faults.numbers import describe_judgement
+from qd.faults.numbers import SEARCHED, describe_judgement
 from qd.search.descriptors import Cells
 from qd.search.directory import RUNS, output_folder
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
@@ -30,6 +32,8 @@ from sim.terrains.maps.heightmap import as_terrain, fitted, read_heightmap
 from sim.terrains.terrains import Terrains
 
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
+WITNESS = "witness"
+"""In place of a controller's name: the one that crosses an elite where it is steered."""
 _MAX_NAME = 120  # characters of a map's path; with robot, controller and ending a file may have 255
 
 
@@ -68,12 +72,34 @@ class ReplaySource:
         """Scale of each penalty."""
         return dict(zip(self.fitness.penalties, self.fitness.scales, strict=True))
 
-    def record(self, device: str, policy: str | None = None) -> list[Recording]:
-        """The recording of each terrain, by another controller if one is named. Only missing ones are crossed."""
+    def requests(self, policy: str | None = None) -> list[CrossingRequest]:
+        """The crossings of each terrain, by another controller if one is named."""
         requests = [terrain.request for terrain in self.terrains]
-        if policy is not None:
-            requests = [replace(request, policy=policy) for request in requests]
-        return Recordings(self.robot, device=device).record(requests)
+        return requests if policy is None else [replace(request, policy=policy) for request in requests]
+
+    def steered_requests(self) -> list[CrossingRequest]:
+        """The crossings of each elite by its witness, the controller that crosses it where it is steered."""
+        run, requests = self.opened_run, []
+        witnesses = None if run is None else run.archive.witnesses
+        for terrain in self.terrains:
+            elite = terrain.elite
+            if run is None or witnesses is None or elite is None or elite.minimal or not witnesses.kind[elite.number]:
+                rule = f"{WITNESS} needs elites for which `faultline judge --stages steered` found a way"
+                raise ValueError(f"{rule}, got {terrain.request.label}: name another controller")
+            walker = str(witnesses.walker[elite.number])
+            policy = terrain.request.policy if walker == SEARCHED else run.certifiers().get(walker)
+            if policy is None:
+                raise ValueError(
+                    f"{WITNESS} of {terrain.request.label} needs the controller {walker}, got no file of it"
+                )
+            ways = np.tile(witnesses.way[elite.number], (1, terrain.request.replicas, 1, 1))
+            steered = replace(terrain.request.terrain, steering=ways)
+            requests.append(replace(terrain.request, terrain=steered, policy=policy))
+        return requests
+
+    def record(self, device: str, requests: Sequence[CrossingRequest] = ()) -> list[Recording]:
+        """The recording of each terrain, or of other crossings. Only missing ones are crossed."""
+        return Recordings(self.robot, device=device).record(requests or self.requests())
 
     def files(self, ending: str, out: Path | None) -> list[Path]:
         """The file of each terrain: in its folder, in a folder ``out``, or ``out``; bad ones are refused at once."""

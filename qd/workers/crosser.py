@@ -87,10 +87,11 @@ class Crosser(ExitStack):
         """Lets a controller (:func:`sim.controllers.loaders.load_policy`) cross each terrain in ``replicas`` episodes.
 
         Penalties are summed from ``penalties_from_s`` of an episode on [s], with ``reward`` the training task's reward
-        too; with ``record`` the result has frames, and is not stored. The progress bar shows ``label``, or ``progress``
-        gets the share that is done. ``room`` are the terrains of the largest call to come that agrees with this one.
-        Many invalid episodes are reported on stderr; a result without a valid one is returned if ``invalid_ok``. Steps
-        and time are those of terrains that were not in the cache. MuJoCo C does not say why an episode is invalid.
+        too; with ``record`` the result has frames. It is not stored then, nor where episodes are steered. The progress
+        bar shows ``label``, or ``progress`` gets the share that is done. ``room`` are the terrains of the largest call
+        to come that agrees with this one. Many invalid episodes are reported on stderr; a result without a valid one is
+        returned if ``invalid_ok``. Steps and time are those of terrains that were not in the cache. MuJoCo C does not
+        say why an episode is invalid.
         """
         if replicas < 1 or engine not in get_args(Engine):
             rule = f"replicas must be 1 or more, engine one of {get_args(Engine)}"
@@ -99,7 +100,7 @@ class Crosser(ExitStack):
             compute=self.compute, robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)),
             replicas=replicas, engine=engine, space=terrains.space.name, reward=reward, record=record,
             penalties_from_s=penalties_from_s, with_ground=terrains.has_ground,
-            with_conditions=terrains.has_conditions,
+            with_conditions=terrains.has_conditions, with_steering=terrains.steering is not None,
         )  # fmt: skip
         if not len(terrains):
             shape = (0, replicas)
@@ -107,9 +108,10 @@ class Crosser(ExitStack):
                 penalties=np.zeros((*shape, len(self.robot.penalties))), penalty_names=self.robot.penalties,
                 outcome=np.zeros(shape, np.uint8), invalidity=np.zeros(shape, np.uint8), fallen=np.zeros(shape, bool),
                 duration_s=np.zeros(shape, np.float32), final_position=np.zeros((*shape, 3), np.float32),
+                deviation=np.zeros(shape, np.float32),
                 reward=np.zeros(shape) if reward else None,
             )  # fmt: skip
-        stored = None if record else self._stored_crossings(cfg, terrains)
+        stored = None if record or terrains.steering is not None else self._stored_crossings(cfg, terrains)
         results = list(stored.read(terrains)) if stored else []
         done = np.concatenate([np.zeros(0, np.intp), *(numbers for numbers, _ in results)])
         missing = np.setdiff1d(np.arange(len(terrains)), done)

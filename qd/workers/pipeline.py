@@ -52,6 +52,8 @@ class PipelineCfg:
     """Whether heights come with maps of friction and softness."""
     with_conditions: bool = False
     """Whether heights come with conditions."""
+    with_steering: bool = False
+    """Whether terrains come with ways of their episodes."""
     penalties_from_s: float = 0.0
     """Penalties are summed from this time of an episode on [s]."""
     reward: bool = False
@@ -150,6 +152,7 @@ def build_simulator(cfg: PipelineCfg, num_terrains: int) -> Simulator:
         space=load_space(cfg.space),
         with_ground=cfg.with_ground,
         with_conditions=cfg.with_conditions,
+        with_steering=cfg.with_steering,
     )
     return RolloutRecorder(rollout) if cfg.record else rollout
 

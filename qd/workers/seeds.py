@@ -19,6 +19,7 @@ class Stream(IntEnum):
     OTHERS_RESOLVED = 7
     VARIED = 8
     MUJOCO_C = 9
+    STEERED = 10
     MINIMISED = 11
     MINIMISED_FRESH = 12
     FRESH_AGAIN = 1001  # of results/make/search_noise.py

@@ -21,7 +21,16 @@ from kernels.state import RobotStep
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
-from sim.mujoco_c.model import NO_SOFTNESS, Starts, crossing_model, goal_commands, observations, step_penalties
+from sim.mujoco_c.model import (
+    NO_SOFTNESS,
+    Starts,
+    crossing_model,
+    distance_from_line,
+    goal_commands,
+    observations,
+    steered_commands,
+    step_penalties,
+)
 from sim.robots.actuator_net import ActuatorNet, Array
 from sim.robots.compiled import mj, robot_spec
 from sim.robots.robot import RobotCfg
@@ -146,12 +155,13 @@ def cross_in_mujoco_c(
     *,
     time_constant_s: float | None = None,
     ground: GroundMaps | None = None,
+    steering: NDArray[np.float32] | None = None,
 ) -> RolloutResult:
     """Run one crossing from each start in plain MuJoCo C, with a controller on the CPU.
 
     It does not tell why an episode is invalid. Heights are those of one terrain [m], shape (nrow, ncol), and so is its
-    ground with its conditions; the contact time constant is that of the robot's file if None. Noise is drawn otherwise
-    than in the parallel simulation.
+    ground with its conditions; the contact time constant is that of the robot's file if None. ``steering`` has a way an
+    episode, as :class:`sim.terrains.terrains.Terrains` has. Noise is drawn otherwise than in the parallel simulation.
     """
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
     episodes = EpisodeStates(robot, model, starts, None if ground is None else ground.rows[0].astype(np.float64))
@@ -162,6 +172,7 @@ def cross_in_mujoco_c(
     outcome = np.full(count, Outcome.RUNNING)
     steps = np.zeros(count, int)
     sums = np.zeros((count, len(PENALTIES)))
+    deviation = np.zeros(count)
     last_action = np.zeros((count, robot.num_joints))
     rows = np.zeros((count, robot.observation_size))
     remembers = reset_all(policy, count)  # it must be asked for the same robots every time
@@ -173,6 +184,9 @@ def cross_in_mujoco_c(
             qpos = episodes.qpos[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, robot.speed)
+            if steering is not None:
+                steered = running[~np.isnan(steering[running, 0, 0])]
+                command[steered] = steered_commands(episodes.qpos[steered], steering[steered])
             seen = (heights, qpos, episodes.qvel[running], command[running], last_action[running])
             row = observations(*seen, default_joint_pos=default, scan=scan)
             touches = 0.01 * np.linalg.norm(episodes.forces[running][:, feet], axis=2)
@@ -191,6 +205,7 @@ def cross_in_mujoco_c(
         judged[(judged == Outcome.RUNNING) & (step + 1 >= max_steps)] = Outcome.TIME_OUT
         outcome[running] = judged
         steps[running] += 1
+        deviation[running] = np.maximum(deviation[running], distance_from_line(episodes.qpos[running]))
         state = (episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running])
         penalties = step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
         sums[running] += robot.physics_dt * penalties
@@ -204,6 +219,7 @@ def cross_in_mujoco_c(
         fallen=upright[None] < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
         duration_s=(steps[None] * robot.physics_dt).astype(np.float32),
         final_position=episodes.qpos[None, :, :3].astype(np.float32),
+        deviation=deviation[None].astype(np.float32),
     )
 
 
@@ -249,8 +265,13 @@ class MujocoC:
             starts = draw_starts(self._robot, grid, int(seed), self._replicas, self._device)
             maps = None if ground is None else ground[index : index + 1]
             how = {"time_constant_s": self._time_constant_s, "ground": maps}
-            chunks = [starts[first : first + _CHUNK] for first in range(0, self._replicas, _CHUNK)]
-            crossed = [cross_in_mujoco_c(self._robot, self._policy, grid, chunk, **how) for chunk in chunks]
+            ways = None if terrains.steering is None else terrains.steering[index]
+            crossed = [
+                cross_in_mujoco_c(
+                    self._robot, self._policy, grid, starts[some], steering=None if ways is None else ways[some], **how
+                )
+                for some in (slice(first, first + _CHUNK) for first in range(0, self._replicas, _CHUNK))
+            ]
             results.append(RolloutResult.join(crossed, axis=1))
             if progress is not None:
                 progress((index + 1) / len(heights))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.episode import LOOKAHEAD, SEGMENTS
 from kernels.ground import FIRM
 from kernels.penalties import PENALTIES, PlainStep
 from sim.crossing import GROUND_FRICTION, CrossingCfg
@@ -224,10 +225,37 @@ def _heading(qpos: Array) -> Array:
 def goal_commands(qpos: Array, speed: float) -> Array:
     """Commanded v_x, v_y [m/s] and yaw rate [rad/s] toward the goal, yaw frame, shape (num, 3)."""
     to_goal = np.array(CrossingCfg.goal) - qpos[:, :2]
-    error = np.arctan2(to_goal[:, 1], to_goal[:, 0]) - _heading(qpos)
-    error = np.arctan2(np.sin(error), np.cos(error))
+    error = _wrap(np.arctan2(to_goal[:, 1], to_goal[:, 0]) - _heading(qpos))
     yaw_rate = np.clip(CrossingCfg.yaw_gain * error, -CrossingCfg.max_yaw_rate, CrossingCfg.max_yaw_rate)
     return np.stack([speed * np.cos(error), speed * np.sin(error), yaw_rate], axis=1)
+
+
+def steered_commands(qpos: Array, steering: NDArray[np.floating]) -> Array:
+    """Commands of robots that are steered, (num, 3), by ways of shape (num, SEGMENTS, 3): :data:`STEERING`."""
+    start, goal = np.array(CrossingCfg.start), np.array(CrossingCfg.goal)
+    length = np.linalg.norm(goal - start)
+    along = (goal - start) / length
+    reached = (qpos[:, :2] - start) @ along
+    segment = np.clip(np.floor(reached / length * SEGMENTS).astype(int), 0, SEGMENTS - 1)
+    speed, offset, heading = steering[np.arange(len(qpos)), segment].astype(np.float64).T
+    ahead = reached + float(LOOKAHEAD)
+    place = start + np.outer(ahead, along) + np.outer(offset, [-along[1], along[0]])
+    way = np.where((ahead < length)[:, None], place, goal) - qpos[:, :2]
+    error = _wrap(np.arctan2(way[:, 1], way[:, 0]) - _heading(qpos))
+    turn = CrossingCfg.yaw_gain * _wrap(error + heading)
+    commands = np.stack([speed * np.cos(error), speed * np.sin(error), turn], axis=1)
+    return np.clip(commands, CrossingCfg.lowest_command, CrossingCfg.highest_command)
+
+
+def distance_from_line(qpos: Array) -> Array:
+    """Distance of bases from the straight line through start and goal [m], shape (num,)."""
+    start, along = np.array(CrossingCfg.start), np.subtract(CrossingCfg.goal, CrossingCfg.start)
+    beside = qpos[:, :2] - start
+    return np.abs(along[0] * beside[:, 1] - along[1] * beside[:, 0]) / np.linalg.norm(along)
+
+
+def _wrap(angle: Array) -> Array:
+    return np.arctan2(np.sin(angle), np.cos(angle))
 
 
 def observations(

@@ -33,10 +33,10 @@ from sim.terrains.bank import make_heights
 from sim.terrains.spaces.registry import get_space, is_user_space
 from sim.terrains.terrains import GroundMaps, Terrains
 
-FORMAT = "faultline recording 3"
+FORMAT = "faultline recording 4"
 """Name and version in every file."""
 _MAPS = tuple(field.name for field in fields(GroundMaps))
-_EPISODE_ARRAYS = ("outcome", "invalidity", "fallen", "duration_s")
+_EPISODE_ARRAYS = ("outcome", "invalidity", "fallen", "duration_s", "deviation")
 _MAX_FORCE = 60_000.0  # [N]; what a float16 can hold
 
 
@@ -69,6 +69,8 @@ class Recording(Frames):
     """Tilt above 60 degrees at the end, shape (T, K)."""
     duration_s: NDArray[np.float32]
     """Simulated time up to the end [s], shape (T, K)."""
+    deviation: NDArray[np.float32]
+    """Largest distance from the straight line between start and goal [m], shape (T, K)."""
     origin: dict[str, Any]
     """Of :func:`sim.controllers.spec.controller_identity` and :func:`sim.files.provenance.provenance`."""
 

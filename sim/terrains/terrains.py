@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kernels.episode import SEGMENTS, STEERING
 from kernels.ground import FIRM, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
 from sim.terrains.conditions.kinds import condition_genes, nominal_row
 from sim.terrains.spaces.base import TerrainSpace
@@ -112,6 +113,10 @@ class Terrains:
     """What genes mean: heights, ground and conditions."""
     ground: GroundMaps | None = None
     """Friction, softness and conditions of heights; None where they change nothing, and beside genes."""
+    steering: NDArray[np.float32] | None = None
+    """Ways of the R episodes of each terrain: :data:`kernels.episode.STEERING` by segment, shape (T, R, SEGMENTS, 3).
+
+    An episode with NaN has the plain command, and so have all without any."""
 
     def __post_init__(self) -> None:
         if (self.genes is None) == (self.heights is None):
@@ -120,6 +125,9 @@ class Terrains:
             raise ValueError(f"seeds must have shape ({len(self.values)},), one a terrain, got {self.seeds.shape}")
         if self.ground is not None and (self.heights is None or len(self.ground) != len(self.heights)):
             raise ValueError(f"ground must belong to as many heights, got ground of {len(self.ground)} terrains")
+        steering, way = self.steering, (SEGMENTS, len(STEERING))
+        if steering is not None and (len(steering) != len(self) or steering.shape[2:] != way):
+            raise ValueError(f"steering must have shape ({len(self)}, episodes, {way}), got {steering.shape}")
 
     @property
     def values(self) -> NDArray[np.float32]:
@@ -153,7 +161,7 @@ class Terrains:
         grounds = [part.ground for part in parts if part.ground is not None]
         arrays: dict[str, Any] = {
             name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("seeds", "genes", "heights")
+            for name in ("seeds", "genes", "heights", "steering")
             if getattr(parts[0], name) is not None
         }
         return replace(parts[0], **arrays, ground=reduce(GroundMaps.joined, grounds) if grounds else None)
@@ -164,6 +172,7 @@ class Terrains:
         shape = str(values.shape[1:]).encode()
         ground = self.ground
         rows = () if ground is None else (ground.friction, ground.time_constant_s, ground.rows)
+        rows += () if self.steering is None else (self.steering,)
         maps = [b"".join(np.float32(array[k]).tobytes() for array in rows) for k in range(len(self))]
         return [
             hashlib.sha256(shape + row.tobytes() + patches + int(seed).to_bytes(4, "little")).digest()

@@ -5,10 +5,12 @@ import pytest
 import warp as wp
 
 from kernels.episode import (
+    SEGMENTS,
     Invalidity,
     Outcome,
     begin_episodes,
     command_goal,
+    command_steered,
     latch_outcomes,
     make_episodes,
     note_base_forces,
@@ -19,7 +21,7 @@ from kernels.queue import clear_rows, make_queue, make_ready, restart_episodes, 
 from kernels.rewards import Rewards, make_rewards
 from kernels.state import RobotStep
 from sim.crossing import CrossingCfg, make_start_ranges, make_task
-from sim.mujoco_c.model import Starts, goal_commands
+from sim.mujoco_c.model import Starts, goal_commands, steered_commands
 from sim.robots.find import get_robot
 from tests.kernels import oracle
 from tests.kernels.states import filled, make_terrain, random_states, rough, upright
@@ -186,6 +188,51 @@ def test_commands_lead_to_the_goal():
     np.testing.assert_allclose(commands(q, [0, 0, Outcome.TIME_OUT]), by_hand, atol=1e-5)
 
 
+def steered(q, steering, episode_of_env, outcome=0):
+    out = wp.full((len(q), 3), 9.0, dtype=float)
+    over = wp.array(np.broadcast_to(outcome, len(q)), dtype=int)
+    ways = wp.array(np.float32(steering), dtype=float)
+    command_steered(wp.array(q), over, ways, wp.array(episode_of_env, dtype=int), create_task(), out)
+    return out.numpy()
+
+
+def test_steered_commands_follow_the_way_of_the_episode():
+    q, qd = random_states(300, 3)
+    rng = np.random.default_rng(4)
+    ways = rng.normal([0.75, 0.0, 0.0], [0.5, 0.5, 0.5], (300, SEGMENTS, 3)).astype(np.float32)
+    order = rng.permutation(300)
+    expected = steered_commands(Starts.of_newton(q, qd, np.zeros(3)).qpos, ways[order])
+    np.testing.assert_allclose(steered(q, ways, order), expected, atol=2e-5)
+
+
+def test_steered_commands_by_hand():
+    # Segments are 1 m. At (5.5, 4), in segment 3, facing the goal; the place ahead is (6.5, 4 + offset).
+    q, _ = upright(6, 3)
+    q[:, :2] = 5.5, 4.0
+    ways = np.zeros((6, SEGMENTS, 3), np.float32)
+    ways[:, 3] = [[0.4, 0, 0], [2.0, 0, 0], [0.6, 1.0, 0], [0.4, 0, 0.6], [np.nan, 0, 0], [0.4, 0, 0]]
+    ways[4, 0, 0] = np.nan
+    # 0.4 m/s ahead. At most 1 m/s. The place lies 45 degrees to the left: 0.6 / sqrt(2) both, yaw rate 0.5 * pi / 4.
+    # 0.6 rad to the left of the way: yaw rate 0.3. Not steered, and ended: what was there stays.
+    by_hand = [[0.4, 0, 0], [1, 0, 0], [0.424264, 0.424264, 0.392699], [0.4, 0, 0.3], [9, 9, 9], [9, 9, 9]]
+    outcome = [0, 0, 0, 0, 0, Outcome.GOAL]
+    np.testing.assert_allclose(steered(q, ways, np.arange(6), outcome), by_hand, atol=1e-5)
+    # Within 1 m of the goal's side of the way the goal itself is the place, whatever the offset; no robot, no command.
+    q[:, :2] = 13.2, 4.0
+    ways[:, -1] = 0.5, 2.0, 0.0
+    np.testing.assert_allclose(steered(q[:1], ways, [0]), [[0.5, 0, 0]], atol=1e-5)
+    np.testing.assert_array_equal(steered(q[:1], ways, [-1]), [[9, 9, 9]])
+
+
+def test_the_largest_distance_from_the_straight_line_is_kept():
+    state = make_state(2)
+    for y in ([4.3, 4.0], [3.4, 4.1], [4.2, 4.0]):
+        q, qd = upright(2, 3)
+        q[:, 1] = y
+        latch((q, qd), state)
+    np.testing.assert_allclose(state.deviation.numpy(), [0.6, 0.1], atol=1e-6)
+
+
 SLOTS, REPLICAS = 3, 4
 
 
@@ -193,7 +240,9 @@ class Robots:
     """Robots without physics: what a test says of their episodes is what happened."""
 
     def __init__(self, num_envs):
-        self.queue = make_queue(num_envs, SLOTS, REPLICAS, 1, rewarded=False, device=str(wp.get_device()))
+        self.queue = make_queue(
+            num_envs, SLOTS, REPLICAS, 1, rewarded=False, steered=False, device=str(wp.get_device())
+        )
         self.episodes = make_episodes(num_envs)
         self.queue.seed.assign(np.arange(7, 7 + SLOTS, dtype=np.uint32))
         self.sums, self.terrain = wp.zeros((num_envs, 1)), wp.zeros(num_envs, dtype=int)

@@ -48,6 +48,7 @@ def recording_of(outcomes, ends_x, *, penalties=None, fallen=None, seed=0, frame
         outcome=np.array([outcomes], np.uint8), invalidity=np.zeros((1, count), np.uint8),
         fallen=np.array([[False] * count if fallen is None else fallen]),
         duration_s=np.full((1, count), 0.02 * (frames - 1), np.float32),
+        deviation=np.zeros((1, count), np.float32),
         num_frames=np.full((1, count), frames, np.int32), base_position=position, base_quaternion=quaternion,
         joint_position=np.zeros((*shape, len(joints)), np.float32),
         foot_force=np.zeros((*shape, len(feet), 3), np.float32),

@@ -33,6 +33,7 @@ def make_result(penalties, *, base_collision=None, invalid=None, late=None, name
         invalidity=np.where(cases[0], np.uint8(2), np.uint8(0)),  # Invalidity.STATE
         fallen=never,
         duration_s=np.full(never.shape, 15.0, dtype=np.float32),
+        deviation=np.zeros(never.shape, dtype=np.float32),
         final_position=np.zeros((*never.shape, 3), dtype=np.float32),
         # In proportion, so that a search among others or in groups comes to the same.
         physics_steps=400 * len(penalties),

@@ -90,7 +90,7 @@ class ViewedRun(OpenedRun):
         name = self.certifier(number)
         if name is not None and self.controllers.get(name) == self.certifiers()[name]:
             return name, ""
-        if not archive.certified[number]:
+        if not archive.certified_by_controllers[number]:
             return None, "No other controller is known to cross it." if archive.failing[number] else ""
         names = compress(archive.certifiers, archive.certificates[number].tolist())
         return None, f"{' and '.join(names)} crosses it, but is not at hand: name its file with --policies."

@@ -1,0 +1,244 @@
+"""Witnesses: ways by which a controller crosses a terrain that stops it under the plain command.
+
+A way says by segment how fast a robot goes, how far beside the straight line, and where it faces
+(:data:`kernels.episode.STEERING`). A cross-entropy search (Rubinstein 1999) finds one for each terrain, by the episodes
+of the controller alone. Fresh episodes, and the plain command on the same seeds, say whether it is a witness.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import false_discovery_control
+
+from kernels.episode import SEGMENTS, STEERING
+from qd.faults.numbers import EPISODES, MAX_FALSE_DISCOVERIES, fisher_p
+from qd.search.archive import Witnesses
+from qd.search.fitness import FAILING_GOAL_RATE
+from qd.workers.crosser import Crosser
+from qd.workers.pipeline import Engine
+from sim.crossing import CrossingCfg
+from sim.rollout import RolloutResult
+from sim.terrains.terrains import Terrains
+
+LINE_M, BESIDE_M = 0.5, 1.0
+"""A way is on the line, or beside it, where the robot is never further from the straight line [m]."""
+_LINE_EPISODES = 5  # of a terrain, to see how far plain crossings are from the line
+
+
+@dataclass(frozen=True, kw_only=True)
+class SteerCfg:
+    """Settings of the search of ways, one episode a sample."""
+
+    generations: int = 12
+    samples: int = EPISODES
+    best: int = 5
+    """Samples that the next generation is drawn near."""
+    step: float = 0.7
+    """How far the distribution moves toward that of the best samples, as a share."""
+    speed_std: float = 0.2
+    """Of the first generation [m/s]."""
+    offset_std: float = 0.25
+    """[m]; four times as much where no limit holds."""
+    heading_std: float = 0.3
+    """[rad]"""
+    least_std: float = 0.05
+    """Of any generation, of all three."""
+    common: float = 0.5
+    """Share of the variance that all segments of a sample have in common."""
+    smooth: float = 1.5
+    """Reach of the correlation of the rest [segments]."""
+    margin_m: float = 0.05
+    """By which ways stay within the limit [m]."""
+    beyond_cost: float = 20.0
+    """Of a metre beyond that, where a metre that is missing to the goal costs 1."""
+
+    @property
+    def seeds(self) -> int:
+        """Seeds of a terrain that :func:`seek_witnesses` needs for each walker."""
+        return 2 * self.generations + 2
+
+
+def seek_witnesses(
+    crosser: Crosser,
+    walkers: Mapping[str, str],
+    terrains: Terrains,
+    seeds: NDArray[np.uint32],
+    limit_m: float,
+    *,
+    rng: np.random.Generator,
+    label: str = "",
+    cfg: SteerCfg | None = None,
+) -> Witnesses:
+    """Witnesses of T terrains: each of the walkers, controllers by name, tries those that have none on the line yet.
+
+    A walker first looks for a way on the line, then for any. ``seeds`` have the shape (T, walkers * cfg.seeds).
+    """
+    cfg = cfg or SteerCfg()
+    count, generations = len(terrains), cfg.generations
+    best = no_witnesses(count, limit_m)
+    for index, (name, policy) in enumerate(walkers.items()):
+        rows = np.flatnonzero(~best.on_line)
+        drawn = seeds[rows, index * cfg.seeds : (index + 1) * cfg.seeds]
+        some, words = terrains[rows], f"{label}{name}"
+        ways = find_ways(
+            crosser,
+            policy,
+            some,
+            drawn[:, :generations],
+            limit_m=limit_m,
+            rng=rng,
+            label=f"{words} on the line",
+            cfg=cfg,
+        )
+        counts = np.zeros((len(rows), 2, 2, 4), np.int64)
+        counts[:, 0] = try_ways(crosser, policy, some, ways, drawn[:, -2], limit_m, label=words)
+        off = np.flatnonzero(counts[:, 0, 1, 0] < FAILING_GOAL_RATE * counts[:, 0, 1, 3])
+        ways[off] = find_ways(
+            crosser,
+            policy,
+            some[off],
+            drawn[off, generations:-2],
+            limit_m=None,
+            rng=rng,
+            label=f"{words} around",
+            cfg=cfg,
+        )
+        counts[off, 0] = try_ways(crosser, policy, some[off], ways[off], drawn[off, -2], limit_m, label=words)
+        cross = np.flatnonzero(counts[:, 0, 1, 2] >= FAILING_GOAL_RATE * np.maximum(counts[:, 0, 1, 3], 1))
+        counts[cross, 1] = try_ways(
+            crosser,
+            policy,
+            some[cross],
+            ways[cross],
+            drawn[cross, -1],
+            limit_m,
+            f"{words}, contact resolved",
+            "resolved",
+        )
+        kind = find_kinds(counts)
+        better = (kind > best.kind[rows]) | (best.walker[rows] == "")
+        chosen = rows[better]
+        for column, values in (("walker", np.full(len(rows), name)), ("kind", kind), ("way", ways), ("counts", counts)):
+            getattr(best, column)[chosen] = values[better]
+    return best
+
+
+def no_witnesses(count: int, limit_m: float) -> Witnesses:
+    """Witnesses of terrains that nobody has tried."""
+    return Witnesses(
+        walker=np.full(count, "", "<U100"),
+        kind=np.zeros(count, np.int64),
+        way=np.zeros((count, SEGMENTS, len(STEERING)), np.float32),
+        counts=np.zeros((count, 2, 2, 4), np.int64),
+        limit_m=limit_m,
+    )
+
+
+def find_ways(
+    crosser: Crosser,
+    policy: str,
+    terrains: Terrains,
+    seeds: NDArray[np.uint32],
+    *,
+    limit_m: float | None,
+    rng: np.random.Generator,
+    label: str,
+    cfg: SteerCfg,
+) -> NDArray[np.float32]:
+    """The best way on each of T terrains, shape (T, SEGMENTS, 3), with a seed a generation, (T, generations).
+
+    Where ``limit_m`` is not None, ways stay so near to the straight line [m].
+    """
+    shape = (len(terrains), SEGMENTS, len(STEERING))
+    mean = np.zeros(shape)
+    mean[..., 0] = crosser.robot.speed
+    offset_std = cfg.offset_std if limit_m is not None else 4.0 * cfg.offset_std
+    std = np.broadcast_to([cfg.speed_std, offset_std, cfg.heading_std], shape).copy()
+    offset = limit_m or CrossingCfg.goal[1]
+    low = [CrossingCfg.lowest_command[0], -offset, -np.pi / 2]
+    high = [CrossingCfg.highest_command[0], offset, np.pi / 2]
+    apart = np.subtract.outer(np.arange(SEGMENTS), np.arange(SEGMENTS))
+    covariance = cfg.common + (1.0 - cfg.common) * np.exp(-0.5 * (apart / cfg.smooth) ** 2)
+    mix = np.linalg.cholesky(covariance + 1e-6 * np.eye(SEGMENTS))
+    for generation in range(cfg.generations):
+        noise = rng.standard_normal((shape[0], cfg.samples, *shape[1:]))
+        ways = np.clip(mean[:, None] + std[:, None] * np.einsum("kl,tslc->tskc", mix, noise), low, high)
+        step = f"{label}, {generation + 1} of {cfg.generations}"
+        result = cross_ways(crosser, policy, terrains, ways, seeds[:, generation], label=step)
+        score = _score(result, limit_m, cfg)
+        order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
+        best = np.take_along_axis(ways, order[..., None, None], axis=1)
+        mean += cfg.step * (best.mean(axis=1) - mean)
+        arrives = score.max(axis=1) > 0.0  # else the next generation is drawn as widely
+        std[arrives] += cfg.step * (best[arrives].std(axis=1) - std[arrives])
+        std = np.maximum(std, cfg.least_std)
+    return mean.astype(np.float32)
+
+
+def _score(result: RolloutResult, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
+    """How good the way of each episode is, shape (T, R): to the goal, and soon; else far ahead; within the limit."""
+    missing = np.abs(CrossingCfg.goal[0] - result.final_position[..., 0])  # ahead: to go aside costs nothing
+    score = np.where(result.reached_goal, 10.0 - 0.1 * result.duration_s, -missing - result.base_collision)
+    if limit_m is not None:
+        score = score - cfg.beyond_cost * np.maximum(result.deviation - (limit_m - cfg.margin_m), 0.0)
+    return np.where(result.invalid, -np.inf, score)
+
+
+def cross_ways(
+    crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.floating], seeds: NDArray[np.uint32],
+    label: str, engine: Engine = "search",
+) -> RolloutResult:  # fmt: skip
+    """Crossings of T terrains, an episode for each way: shape (T, R, SEGMENTS, 3)."""
+    steered = replace(terrains, seeds=seeds, steering=ways.astype(np.float32))
+    replicas = ways.shape[1]
+    return crosser.cross(policy, steered, replicas=replicas, engine=engine, label=label, invalid_ok=True)
+
+
+def try_ways(
+    crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.float32], seeds: NDArray[np.uint32],
+    limit_m: float, label: str, engine: Engine = "search",
+) -> NDArray[np.int64]:  # fmt: skip
+    """20 episodes under the plain command and as many steered, from the same starts, as ``Witnesses.counts`` has them.
+
+    Shape (T, 2, 4).
+    """
+    limits = (limit_m, max(limit_m, BESIDE_M), np.inf)
+    tables = []
+    for tried in (np.full_like(ways, np.nan), ways):
+        repeated = np.repeat(tried[:, None], EPISODES, axis=1)
+        result = cross_ways(crosser, policy, terrains, repeated, seeds, label, engine)
+        reached = [(result.reached_goal & (result.deviation <= limit)).sum(axis=1) for limit in limits]
+        tables.append(np.stack([*reached, (~result.invalid).sum(axis=1)], axis=1))
+    return np.stack(tables, axis=1)
+
+
+def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The kind of witness that each of T ways is, as its index in :data:`WITNESSES`, shape (T,).
+
+    ``counts`` are those of ``Witnesses.counts``. A way is a witness if it leads at least half of the episodes to the
+    goal, and more than the plain command does, with both physics (Fisher's exact test; Benjamini and Hochberg 1995).
+    """
+    kinds = np.zeros(len(counts), np.int64)
+    if not len(counts):
+        return kinds
+    goals_plain, valid_plain = counts[:, :, 0, 2], counts[:, :, 0, 3]
+    valid = counts[:, :, 1, 3]
+    for kind, column in ((1, 2), (2, 1), (3, 0)):
+        goals = counts[:, :, 1, column]
+        p = fisher_p(goals, valid, goals_plain, valid_plain).max(axis=1)
+        crosses = ((goals >= FAILING_GOAL_RATE * valid) & (valid > 0)).all(axis=1)
+        lucky = false_discovery_control(np.clip(p, 0.0, 1.0)) > MAX_FALSE_DISCOVERIES
+        kinds[crosses & ~lucky] = kind
+    return kinds
+
+
+def measure_line(crosser: Crosser, policy: str, terrains: Terrains) -> float:
+    """Largest distance from the straight line of a way on the line [m].
+
+    It is :data:`LINE_M`, or the 95th percentile of the distances of plain crossings of ``terrains`` if that is more.
+    """
+    result = crosser.cross(policy, terrains, replicas=_LINE_EPISODES, invalid_ok=True, label="plain crossings")
+    distances = result.deviation[result.reached_goal]
+    return max(LINE_M, float(np.quantile(distances, 0.95)) if len(distances) else 0.0)
