@@ -178,13 +178,13 @@ class JudgeCommand(_RunFlags):
     controller still crosses under half of them, and another at least half. mujoco_c: 150 faults at random, one a family
     first, are crossed in MuJoCo C with steps of 1 ms, in 6 episodes, or 10 if these do not decide whether half of 10
     reach the goal. A fault holds there if the controller crosses under half, and its best certifier at least half.
-    Crossings are kept, so the same command goes on after Ctrl-C.
+    Crossings are kept, but those of steered, so the same command goes on after Ctrl-C.
     """
 
     stages: tuple[str, ...] = ("fresh", "resolved", "others")
     """Some of fresh, resolved, others, steered, varied, mujoco_c, in the order in which to do them."""
     steered: PositiveInt | None = None
-    """Terrains for which steered seeks ways at most; 20 on the CPU and all on a GPU if left out."""
+    """Terrains for which steered seeks ways at most, the hardest first; 20 on the CPU and all on a GPU if left out."""
     skip_level_ground: bool = False
     """Judge though the controller of a robot of yours does not cross level ground."""
 

@@ -14,7 +14,7 @@ from kernels.super_gaussian import LOWER, UPPER
 from qd.evaluate.measures import Performance, measure
 from qd.evaluate.sets import TerrainSet, plain_set
 from qd.evaluate.tables import Tables, make_tables
-from qd.search.archive import Archive, FreshValues, no_outcomes, write_archive
+from qd.search.archive import Archive, FreshValues, no_outcomes, no_witnesses, write_archive
 from qd.search.fitness import Evaluation
 from sim.files.atomic import to_json
 from sim.robots.find import get_robot
@@ -114,6 +114,14 @@ def judged_archive() -> Archive:
             [[never, half], [[14, 0, 0, 6], never], [half, never], [never, never], [much, much]]
         ),
     )
+
+
+def steered_archive() -> Archive:
+    """The judged archive with ways: on the line of elite 1 by the searched controller, around of elite 3 by C-G."""
+    witnesses = no_witnesses(5, 0.5)
+    witnesses.walker[[1, 3]], witnesses.kind[[1, 3]], witnesses.way[[1, 3], :, 0] = ["searched", "C-G"], [3, 1], 0.5
+    witnesses.counts[[1, 3]] = [[[0, 0, 0, 20], [17, 17, 18, 20]]], [[[0, 0, 0, 20], [0, 3, 14, 20]]]
+    return replace(judged_archive(), witnesses=witnesses)
 
 
 def make_set(count: int, first: int = 0) -> TerrainSet:

@@ -296,7 +296,9 @@ def summarise_search(ranking: Ranking, archive: Archive) -> str:
     commonest = next(iter(ranking.by_cause()), UNCLEAR)
     cause = describe_commonest(commonest) if failing > 1 else f"cause: {commonest}"
     asked = failing and (archive.certifiers or archive.witnesses is not None)
+    among = archive.is_fault if archive.is_fault.any() else archive.certified
     judged = {"asked": asked, "certified": archive.certified.sum()}
-    judged["steered"] = (archive.is_fault & ~archive.certified_by_controllers).sum()
+    judged["others"] = archive.certified_by_controllers[among].any()
+    judged["steered"] = not archive.certified_by_controllers[among].all()
     counts = {"count": len(ranking), "failing": failing, "faults": count_faults(archive), **judged}
     return TEMPLATES.get_template("summary.txt").render(cause="" if commonest == UNCLEAR else cause, **counts)

@@ -27,7 +27,7 @@ from qd.faults.numbers import (
     fresh_numbers,
 )
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
-from qd.faults.steer import SteerCfg, measure_line, no_witnesses, seek_witnesses
+from qd.faults.steer import SteerCfg, measure_line, seek_witnesses
 from qd.search.archive import (
     ARCHIVE_FILE,
     NO_FURTHER_OUTCOMES,
@@ -35,6 +35,7 @@ from qd.search.archive import (
     Archive,
     FreshValues,
     goal_rates,
+    no_witnesses,
     write_archive,
 )
 from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
@@ -214,6 +215,9 @@ class Others(Stage):
                 columns[field] = table
             if hashes != stored:
                 columns |= NO_FURTHER_OUTCOMES
+            if hashes != stored and (witnesses := archive.witnesses) is not None:
+                by = np.flatnonzero(witnesses.walker == name)
+                columns["witnesses"] = witnesses.updated(by, no_witnesses(len(by), witnesses.limit_m))
             archive = replace(archive, certifiers=tuple(hashes), certifier_sha256=tuple(hashes.values()), **columns)
         return archive
 
@@ -237,17 +241,14 @@ class Steered(Stage):
         times = len(walkers) * cfg.seeds
         seeds = elite_seeds(archive, search.cfg.seed, times, stream=Stream.STEERED).reshape(-1, times)[rows]
         level = at_height(SUPER_GAUSSIAN, MAX_HEIGHT * search.space.height_share)
-        plain = plain_set("hard_random", _LINE_TERRAINS, search.cfg.seed, level).terrains
-        limit_m = measure_line(crosser, search.policy, plain)
-        rng = np.random.default_rng([search.cfg.seed, Stream.STEERED])
+        plain = plain_set("hard_random", _LINE_TERRAINS, search.cfg.seed, level, "validation").terrains
+        limit_m = measure_line(crosser, search.policy, plain, judging.step)
+        rng = np.random.default_rng(np.random.SeedSequence([search.cfg.seed], spawn_key=(Stream.STEERED,)))
         some = seek_witnesses(crosser, walkers, terrains, seeds, limit_m, rng=rng, label=judging.step, cfg=cfg)
-        witnesses = no_witnesses(len(archive), limit_m)
-        for name, values in vars(some).items():
-            if isinstance(values, np.ndarray):
-                getattr(witnesses, name)[rows] = values
         found = [f"{(some.kind == kind).sum()} {words}" for kind, words in _WITNESS_WORDS.items()]
-        print(f"Witnesses on {len(rows)} terrains that no other controller crosses: {', '.join(found)}.", flush=True)
-        return replace(archive, witnesses=witnesses)
+        print(f"Steered, robots cross {', '.join(found)}, of {len(rows)} terrains not certified before.", flush=True)
+        before = archive.witnesses or no_witnesses(len(archive), limit_m)
+        return replace(archive, witnesses=before.updated(rows, some))
 
 
 class OfFaults(Stage):
@@ -258,9 +259,10 @@ class OfFaults(Stage):
     def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
         """Refuses a search without faults, and certifiers that are not at hand."""
         super().check(archive, judging, before)
-        faults = archive.certified if "resolved" in before else archive.is_fault
+        faults = archive.certified_by_controllers & (archive.confirmed | ("resolved" in before))
         if "others" not in before and ("fresh" in before or not faults.any()):
-            raise ValueError(f"stages must have others before {self.name}: {judging.search.run} has no faults to cross")
+            rule = f"stages must have others before {self.name}"
+            raise ValueError(f"{rule}: {judging.search.run} has no faults that another controller crosses")
         self._check_certifiers(archive, judging, renewed="others" in before)
 
     @staticmethod

@@ -211,14 +211,15 @@ def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
 def describe_judgement(archive: Archive, number: int) -> list[str]:
     """What is known of an elite, in sentences; none where nobody crossed it under other conditions."""
     rates = {label: format_rate(*rate) for label, rate in further_rates(archive, number).items()}
-    if not rates:
+    witness = describe_witness(archive, number)
+    if not rates and not witness:
         return []
-    crossers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
-    known = {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
+    known: dict[str, Any] = {"rates": rates, "witness": witness}
+    known["crossers"] = [*compress(archive.certifiers, archive.certificates[number].tolist())]
+    known |= {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
     known["in_mujoco_c"] = archive.mujoco_c_outcomes is not None and archive.mujoco_c_outcomes[number].any()
     known["on_line"] = archive.witnesses is not None and archive.witnesses.on_line[number]
-    known["witness"] = describe_witness(archive, number)
-    return TEMPLATES.get_template("elite.txt").render(rates=rates, crossers=crossers, **known).splitlines()
+    return TEMPLATES.get_template("elite.txt").render(known).splitlines()
 
 
 def describe_witness(archive: Archive, number: int) -> str:
@@ -236,9 +237,9 @@ def describe_witness(archive: Archive, number: int) -> str:
 def describe_way(way: NDArray[np.float32]) -> str:
     """What a way tells a robot to do, in words: how fast, slowest where, and where furthest from the straight line."""
     ends = np.linspace(CrossingCfg.start[0], CrossingCfg.goal[0], len(way) + 1)
-    speed, offset = way[:, 0], way[:, 1]
+    speed, offset = way[:, 0], way[:-1, 1]  # in the last segment the robot is sent to the goal
     slow, aside = int(speed.argmin()), int(np.abs(offset).argmax())
-    places = [f"from x = {ends[k]:.0f} to {ends[k + 1]:.0f} m" for k in (slow, aside)]
+    places = [f"from x = {ends[k]:.0f} to {ends[k + 1]:.0f} m" for k in (slow, aside + 1)]  # an offset is for ahead
     is_even = speed.max() - speed.min() < 0.15
     words = f"at {speed.mean():.1f} m/s" if is_even else f"slowed to {speed[slow]:.1f} m/s {places[0]}"
     side = f"{abs(offset[aside]):.1f} m to the {'left' if offset[aside] > 0 else 'right'} {places[1]}"

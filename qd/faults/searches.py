@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from qd.faults.numbers import SEARCHED
 from qd.search.archive import Archive, read_archive
 from qd.search.directory import RunDirectory, check_config, check_space
 from qd.search.settings import SearchCfg, as_settings, find_policy, is_searched
@@ -65,6 +66,8 @@ def find_certifiers(search: Search) -> dict[str, str]:
 def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str) -> None:
     """Tries each certifier on the robot; refuses the searched controller, which cannot certify itself."""
     for name, policy in certifiers.items():
+        if name == SEARCHED:
+            raise ValueError(f"certifier {name} must have another name: so is the searched controller called")
         if controller_hash(policy) is None:
             rule = f"certifier {name} must have a file, by whose hash certificates name it"
             raise ValueError(f"{rule}, got {policy}, where there is none: give the path of one")

@@ -7,6 +7,7 @@ of the controller alone. Fresh episodes, and the plain command on the same seeds
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,13 @@ from scipy.stats import false_discovery_control
 
 from kernels.episode import SEGMENTS, STEERING
 from qd.faults.numbers import EPISODES, MAX_FALSE_DISCOVERIES, fisher_p
-from qd.search.archive import Witnesses
+from qd.search.archive import Witnesses, no_witnesses
 from qd.search.fitness import FAILING_GOAL_RATE
+from qd.search.progress import Bar
 from qd.workers.crosser import Crosser
-from qd.workers.pipeline import Engine
+from qd.workers.pipeline import Engine, Progress
 from sim.crossing import CrossingCfg
+from sim.rates import MAX_INVALID_SHARE
 from sim.rollout import RolloutResult
 from sim.terrains.terrains import Terrains
 
@@ -92,8 +95,10 @@ def seek_witnesses(
             label=f"{words} on the line",
             cfg=cfg,
         )
+        plain = np.full_like(ways, np.nan)
         counts = np.zeros((len(rows), 2, 2, 4), np.int64)
-        counts[:, 0] = try_ways(crosser, policy, some, ways, drawn[:, -2], limit_m, label=words)
+        for column, tried in enumerate((plain, ways)):
+            counts[:, 0, column] = try_ways(crosser, policy, some, tried, drawn[:, -2], limit_m, label=words)
         off = np.flatnonzero(counts[:, 0, 1, 0] < FAILING_GOAL_RATE * counts[:, 0, 1, 3])
         ways[off] = find_ways(
             crosser,
@@ -105,35 +110,18 @@ def seek_witnesses(
             label=f"{words} around",
             cfg=cfg,
         )
-        counts[off, 0] = try_ways(crosser, policy, some[off], ways[off], drawn[off, -2], limit_m, label=words)
+        counts[off, 0, 1] = try_ways(crosser, policy, some[off], ways[off], drawn[off, -2], limit_m, label=words)
         cross = np.flatnonzero(counts[:, 0, 1, 2] >= FAILING_GOAL_RATE * np.maximum(counts[:, 0, 1, 3], 1))
-        counts[cross, 1] = try_ways(
-            crosser,
-            policy,
-            some[cross],
-            ways[cross],
-            drawn[cross, -1],
-            limit_m,
-            f"{words}, contact resolved",
-            "resolved",
-        )
+        for column, tried in enumerate((plain, ways)):
+            how: Any = {"label": f"{words}, contact resolved", "engine": "resolved"}
+            counts[cross, 1, column] = try_ways(
+                crosser, policy, some[cross], tried[cross], drawn[cross, -1], limit_m, **how
+            )
         kind = find_kinds(counts)
-        better = (kind > best.kind[rows]) | (best.walker[rows] == "")
-        chosen = rows[better]
-        for column, values in (("walker", np.full(len(rows), name)), ("kind", kind), ("way", ways), ("counts", counts)):
-            getattr(best, column)[chosen] = values[better]
+        tried = Witnesses(walker=np.full(len(rows), name), kind=kind, way=ways, counts=counts, limit_m=limit_m)
+        better = np.flatnonzero((kind > best.kind[rows]) | (best.walker[rows] == ""))
+        best = best.updated(rows[better], tried.rows(better))
     return best
-
-
-def no_witnesses(count: int, limit_m: float) -> Witnesses:
-    """Witnesses of terrains that nobody has tried."""
-    return Witnesses(
-        walker=np.full(count, "", "<U100"),
-        kind=np.zeros(count, np.int64),
-        way=np.zeros((count, SEGMENTS, len(STEERING)), np.float32),
-        counts=np.zeros((count, 2, 2, 4), np.int64),
-        limit_m=limit_m,
-    )
 
 
 def find_ways(
@@ -162,25 +150,30 @@ def find_ways(
     apart = np.subtract.outer(np.arange(SEGMENTS), np.arange(SEGMENTS))
     covariance = cfg.common + (1.0 - cfg.common) * np.exp(-0.5 * (apart / cfg.smooth) ** 2)
     mix = np.linalg.cholesky(covariance + 1e-6 * np.eye(SEGMENTS))
-    for generation in range(cfg.generations):
-        noise = rng.standard_normal((shape[0], cfg.samples, *shape[1:]))
-        ways = np.clip(mean[:, None] + std[:, None] * np.einsum("kl,tslc->tskc", mix, noise), low, high)
-        step = f"{label}, {generation + 1} of {cfg.generations}"
-        result = cross_ways(crosser, policy, terrains, ways, seeds[:, generation], label=step)
-        score = _score(result, limit_m, cfg)
-        order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
-        best = np.take_along_axis(ways, order[..., None, None], axis=1)
-        mean += cfg.step * (best.mean(axis=1) - mean)
-        arrives = score.max(axis=1) > 0.0  # else the next generation is drawn as widely
-        std[arrives] += cfg.step * (best[arrives].std(axis=1) - std[arrives])
-        std = np.maximum(std, cfg.least_std)
+    with Bar(label, cfg.generations) as bar:
+        for generation in range(cfg.generations):
+            noise = rng.standard_normal((shape[0], cfg.samples, *shape[1:]))
+            ways = np.clip(mean[:, None] + std[:, None] * np.einsum("kl,tslc->tskc", mix, noise), low, high)
+            drawn, move = seeds[:, generation], bar.within(generation, 1.0)
+            result = cross_ways(crosser, policy, terrains, ways, drawn, label=label, progress=move)
+            score = score_ways(result, crosser.robot.max_duration_s, limit_m, cfg)
+            order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
+            best = np.take_along_axis(ways, order[..., None, None], axis=1)
+            mean += cfg.step * (best.mean(axis=1) - mean)
+            arrives = score.max(axis=1) > 0.0  # else the next generation is drawn as widely
+            std[arrives] += cfg.step * (best[arrives].std(axis=1) - std[arrives])
+            std = np.maximum(std, cfg.least_std)
     return mean.astype(np.float32)
 
 
-def _score(result: RolloutResult, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
-    """How good the way of each episode is, shape (T, R): to the goal, and soon; else far ahead; within the limit."""
+def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
+    """How good the way of each episode is, shape (T, R): to the goal, and soon; else far ahead; within the limit.
+
+    ``longest_s`` is the time after which a crossing ends [s]. A way that leads to the goal has more than 0.
+    """
     missing = np.abs(CrossingCfg.goal[0] - result.final_position[..., 0])  # ahead: to go aside costs nothing
-    score = np.where(result.reached_goal, 10.0 - 0.1 * result.duration_s, -missing - result.base_collision)
+    soon = 10.0 - 2.0 * result.duration_s / longest_s
+    score = np.where(result.reached_goal, soon, -missing - result.base_collision)
     if limit_m is not None:
         score = score - cfg.beyond_cost * np.maximum(result.deviation - (limit_m - cfg.margin_m), 0.0)
     return np.where(result.invalid, -np.inf, score)
@@ -188,30 +181,26 @@ def _score(result: RolloutResult, limit_m: float | None, cfg: SteerCfg) -> NDArr
 
 def cross_ways(
     crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.floating], seeds: NDArray[np.uint32],
-    label: str, engine: Engine = "search",
+    label: str, engine: Engine = "search", progress: Progress | None = None,
 ) -> RolloutResult:  # fmt: skip
     """Crossings of T terrains, an episode for each way: shape (T, R, SEGMENTS, 3)."""
     steered = replace(terrains, seeds=seeds, steering=ways.astype(np.float32))
-    replicas = ways.shape[1]
-    return crosser.cross(policy, steered, replicas=replicas, engine=engine, label=label, invalid_ok=True)
+    how: dict[str, Any] = {"replicas": ways.shape[1], "engine": engine, "progress": progress}
+    return crosser.cross(policy, steered, **how, label=label, invalid_ok=True)
 
 
 def try_ways(
     crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.float32], seeds: NDArray[np.uint32],
     limit_m: float, label: str, engine: Engine = "search",
 ) -> NDArray[np.int64]:  # fmt: skip
-    """20 episodes under the plain command and as many steered, from the same starts, as ``Witnesses.counts`` has them.
+    """20 episodes by each of T ways, or under the plain command where it is NaN, as ``Witnesses.counts`` has them.
 
-    Shape (T, 2, 4).
+    Shape (T, 4).
     """
     limits = (limit_m, max(limit_m, BESIDE_M), np.inf)
-    tables = []
-    for tried in (np.full_like(ways, np.nan), ways):
-        repeated = np.repeat(tried[:, None], EPISODES, axis=1)
-        result = cross_ways(crosser, policy, terrains, repeated, seeds, label, engine)
-        reached = [(result.reached_goal & (result.deviation <= limit)).sum(axis=1) for limit in limits]
-        tables.append(np.stack([*reached, (~result.invalid).sum(axis=1)], axis=1))
-    return np.stack(tables, axis=1)
+    result = cross_ways(crosser, policy, terrains, np.repeat(ways[:, None], EPISODES, axis=1), seeds, label, engine)
+    reached = [(result.reached_goal & (result.deviation <= limit)).sum(axis=1) for limit in limits]
+    return np.stack([*reached, (~result.invalid).sum(axis=1)], axis=1)
 
 
 def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -219,26 +208,29 @@ def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
     ``counts`` are those of ``Witnesses.counts``. A way is a witness if it leads at least half of the episodes to the
     goal, and more than the plain command does, with both physics (Fisher's exact test; Benjamini and Hochberg 1995).
+    No more than a quarter of the episodes of either may be invalid.
     """
     kinds = np.zeros(len(counts), np.int64)
     if not len(counts):
         return kinds
     goals_plain, valid_plain = counts[:, :, 0, 2], counts[:, :, 0, 3]
     valid = counts[:, :, 1, 3]
+    known = (counts[..., 3] >= (1.0 - MAX_INVALID_SHARE) * EPISODES).all(axis=(1, 2))
     for kind, column in ((1, 2), (2, 1), (3, 0)):
         goals = counts[:, :, 1, column]
         p = fisher_p(goals, valid, goals_plain, valid_plain).max(axis=1)
-        crosses = ((goals >= FAILING_GOAL_RATE * valid) & (valid > 0)).all(axis=1)
+        crosses = known & (goals >= FAILING_GOAL_RATE * valid).all(axis=1)
         lucky = false_discovery_control(np.clip(p, 0.0, 1.0)) > MAX_FALSE_DISCOVERIES
         kinds[crosses & ~lucky] = kind
     return kinds
 
 
-def measure_line(crosser: Crosser, policy: str, terrains: Terrains) -> float:
+def measure_line(crosser: Crosser, policy: str, terrains: Terrains, label: str = "") -> float:
     """Largest distance from the straight line of a way on the line [m].
 
     It is :data:`LINE_M`, or the 95th percentile of the distances of plain crossings of ``terrains`` if that is more.
     """
-    result = crosser.cross(policy, terrains, replicas=_LINE_EPISODES, invalid_ok=True, label="plain crossings")
+    label = f"{label}how far from the straight line it goes unsteered"
+    result = crosser.cross(policy, terrains, replicas=_LINE_EPISODES, invalid_ok=True, label=label)
     distances = result.deviation[result.reached_goal]
     return max(LINE_M, float(np.quantile(distances, 0.95)) if len(distances) else 0.0)

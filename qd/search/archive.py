@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import STEERING
+from kernels.episode import SEGMENTS, STEERING
 from qd.search.descriptors import Cells
 from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
 from sim.files.atomic import write_atomically
@@ -65,8 +65,29 @@ class Witnesses:
 
     def rows(self, chosen: NDArray[Any]) -> "Witnesses":
         """The ways on some of the elites alone, in the order given."""
-        columns: dict[str, Any] = {name: vars(self)[name][chosen] for name in ("walker", "kind", "way", "counts")}
+        return replace(self, **{name: column[chosen] for name, column in self._columns.items()})
+
+    def updated(self, rows: NDArray[np.int64], others: "Witnesses") -> "Witnesses":
+        """The ways with those on some of the elites replaced by as many others."""
+        columns = {name: column.copy() for name, column in self._columns.items()}
+        for name, column in columns.items():
+            column[rows] = others._columns[name]
         return replace(self, **columns)
+
+    @property
+    def _columns(self) -> dict[str, Any]:
+        return {name: vars(self)[name] for name in ("walker", "kind", "way", "counts")}
+
+
+def no_witnesses(count: int, limit_m: float) -> Witnesses:
+    """Witnesses of elites that nobody has tried."""
+    return Witnesses(
+        walker=np.full(count, "", "<U255"),
+        kind=np.zeros(count, np.int64),
+        way=np.zeros((count, SEGMENTS, len(STEERING)), np.float32),
+        counts=np.zeros((count, 2, 2, 4), np.int64),
+        limit_m=limit_m,
+    )
 
 
 OUTCOMES = ("goal", "base_collision", "other", "invalid")
@@ -243,8 +264,8 @@ class Archive(Evaluation, Subject):
 
     @property
     def is_judged(self) -> bool:
-        """Whether anything was crossed with contact resolved or by other controllers."""
-        return bool(self.certifiers) or bool(self.resolved_outcomes.any())
+        """Whether anything was crossed with contact resolved, by other controllers, or steered."""
+        return bool(self.certifiers) or bool(self.resolved_outcomes.any()) or self.witnesses is not None
 
     def rows(self, chosen: NDArray[Any]) -> "Archive":
         """The archive with some of its elites alone, in the order given."""
@@ -317,19 +338,24 @@ def read_archive(path: str | Path) -> Archive:
         names = [name for name in (*_SETTINGS, *_FOUND) if name not in _OPTIONAL or name in stored]
         names += [name for group in _BY_JUDGING if not stored.isdisjoint(group) for name in group]
         arrays = read_arrays(file, names)
-        sizes = {"2": 2, "3": len(STEERING), "4": len(OUTCOMES)}
+        sizes = {"2": 2, "3": len(STEERING), "4": len(OUTCOMES), "S": SEGMENTS}
         check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
         for name, array in arrays.items():
             kinds, content = ("U", "texts") if name in _TEXTS else ("bif", "numbers")
             if array.dtype.kind not in kinds:
                 raise ValueError(f"{name} must hold {content}, got {array.dtype}")
-            if name in ("genes", "fitness", "scales") and not np.isfinite(array).all():
+            if (
+                name in ("genes", "fitness", "scales", "witness_way", "witness_limit_m")
+                and not np.isfinite(array).all()
+            ):
                 raise ValueError(f"{name} must be finite")
         values: dict[str, Any] = no_outcomes(len(arrays["fitness"])) | arrays
         for name in arrays.keys() & {*_SETTINGS, *_CERTIFIERS}:  # as the dataclass has them
             values[name] = tuple(array.tolist()) if (array := arrays[name]).ndim else array.item()
         fresh = {name.removeprefix(_PREFIX): values.pop(name) for name in _FRESH if name in values}
         steered = {name.removeprefix(_WITNESS): values.pop(name) for name in _STEERED if name in values}
+        if steered and not np.isin(steered["kind"], np.arange(len(WITNESSES))).all():
+            raise ValueError(f"witness_kind must be from 0 to {len(WITNESSES) - 1}")
         witnesses = Witnesses(**{**steered, "limit_m": float(steered["limit_m"])}) if steered else None
         return Archive(**values, fresh=FreshValues(**fresh) if fresh else None, witnesses=witnesses)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types

@@ -87,7 +87,8 @@ class ReplaySource:
                 rule = f"{WITNESS} needs elites for which `faultline judge --stages steered` found a way"
                 raise ValueError(f"{rule}, got {terrain.request.label}: name another controller")
             walker = str(witnesses.walker[elite.number])
-            policy = terrain.request.policy if walker == SEARCHED else run.certifiers().get(walker)
+            searched = run.policy() if self.by else terrain.request.policy
+            policy = searched if walker == SEARCHED else run.certifiers().get(walker)
             if policy is None:
                 raise ValueError(
                     f"{WITNESS} of {terrain.request.label} needs the controller {walker}, got no file of it"

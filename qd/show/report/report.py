@@ -10,7 +10,7 @@ from kernels.episode import Outcome
 from qd.evaluate.tables import read_tables
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
-from qd.faults.numbers import MinimalTerrains, fault_numbers, further_rates
+from qd.faults.numbers import MinimalTerrains, describe_witness, fault_numbers, further_rates
 from qd.search.directory import METRICS_FILE, ROUNDS_FILE, RunDirectory, output_folder
 from qd.search.progress import Bar
 from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
@@ -158,6 +158,7 @@ def _make_case(
         "time_s": moments[0][2],
         "conditions": opened_run.space.condition_text(opened_run.archive.genes[number]),
         "beside": beside,
+        "witness": describe_witness(opened_run.archive, number),
         "figure": "",
         "rate": rate,
         "rates": page.Table(head=["goal reached", "", "95 % interval"], rows=rows),
@@ -193,7 +194,7 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
         "place": without_machine(str(opened_run.path)),
         "summary": summarise_search(ranking, archive),
         "failing": int(ranking.failing.sum()),
-        "certifiers": " or ".join(archive.certifiers),
+        "certifiers": " or ".join(archive.certifiers + ("a robot that is steered",) * (archive.witnesses is not None)),
         "numbers": fault_numbers(archive),
         "fault_families": len(np.unique(ranking.families[ranking.verdict == _FAULT])),
         "means": {name: format_mean(getattr(ranking, f"{name}_rate"), ranking.families) for name in _MEANS},

@@ -19,7 +19,7 @@ from qd.faults.judge import (
     is_decided,
     judge,
 )
-from qd.search.archive import read_archive, write_archive
+from qd.search.archive import no_witnesses, read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
 from qd.workers.seeds import Stream
@@ -280,6 +280,51 @@ def test_mujoco_c_crosses_faults_alone_and_no_soft_ground(path):
         InMujocoC().check(read_archive(path), soft, ())
 
 
+def witnessed(path, monkeypatch, kinds=(3,), **changes):
+    """The archive after the stage steered, whose search finds such ways, and what it was asked: walkers and seeds."""
+    asked = []
+
+    def seek(crosser, walkers, terrains, seeds, limit_m, *, rng, label, cfg):
+        asked.append((walkers, terrains.genes, seeds))
+        found = no_witnesses(len(terrains), limit_m)
+        found.walker[:], found.kind[:] = [*walkers][-1], np.resize(kinds, len(terrains))
+        return found
+
+    monkeypatch.setattr("qd.faults.judge.seek_witnesses", seek)
+    return judged(path, stages=("steered",), **changes), asked
+
+
+def test_ways_are_sought_where_no_controller_certifies_and_are_kept(path, monkeypatch):
+    before = judged(path)
+    rows = np.flatnonzero(before.confirmed & ~before.certified)
+    archive, [(walkers, genes, seeds)] = witnessed(path, monkeypatch, (3, 0, 2))
+    assert walkers == {"searched": SHIPPED, **OTHER} and np.array_equal(genes, before.genes[rows])
+    assert len({*seeds.ravel().tolist()}) == seeds.size == len(rows) * 2 * 26
+    assert archive.witnesses.kind[rows].tolist() == np.resize([3, 0, 2], len(rows)).tolist()
+    numbers, by_ways = numbers_in(path), int((archive.witnesses.kind == 3).sum())
+    assert numbers["faults_witness"] == by_ways == numbers["faults"] - numbers["faults_controllers"] > 0
+    assert numbers["witnesses"]["tried"] == len(rows) and read_archive(path).is_fault.sum() == numbers["faults"]
+    # Of one terrain ways are sought again, by the searched controller alone: what is known of the others stays.
+    again, [(walkers, genes, _)] = witnessed(path, monkeypatch, (1,), most_steered=1, certifiers={})
+    assert [*walkers] == ["searched"] and len(genes) == 1
+    assert again.witnesses.kind[rows].tolist() == [1, *archive.witnesses.kind[rows][1:].tolist()]
+    # Another certifier takes nothing from it; another controller of the name has no ways yet.
+    kept = judged(path, stages=("others",), certifiers={"S": WEAK})
+    assert np.array_equal(kept.witnesses.kind, again.witnesses.kind)
+    other = judged(path, stages=("others",), certifiers={"C-G": WEAK}).witnesses
+    assert np.flatnonzero(other.walker != "").tolist() == rows[:1].tolist() and other.kind.sum() == 1
+
+
+def test_faults_by_ways_alone_are_not_crossed_by_certifiers_again(path, monkeypatch):
+    archive, [(walkers, genes, _)] = witnessed(path, monkeypatch)  # before it was confirmed
+    assert [*walkers] == ["searched"] and len(genes) == archive.failing.sum()
+    assert numbers_in(path)["certified"] == len(genes) and np.array_equal(read_archive(path).certified, archive.failing)
+    assert judged(path, stages=("resolved",), certifiers={}).is_fault.any()
+    for stage in ("varied", "mujoco_c"):
+        with pytest.raises(ValueError, match=r"stages .* no faults"):
+            judged(path, Robots(cross_by_genes, stop_after=0), stages=(stage,), certifiers={})
+
+
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
     first = judged(path)
     copy = shutil.copy(OTHER["C-G"], tmp_path / "C-G-2.pt")
@@ -316,6 +361,7 @@ def test_the_panel_and_the_certifiers_of_the_run_judge_without_the_searched_cont
     [
         ("policy", {"policy": OTHER["C-G"]}),
         ("certifier me", {"certifiers": {"me": SHIPPED}}),
+        ("certifier searched", {"certifiers": {"searched": OTHER["C-G"]}}),
         ("certifier C-G", {"certifiers": {"C-G": str(ROBOTS["cassie"].panel / "C-G.pt")}}),
         ("certifier S", {"certifiers": {"S": "sys:exit"}}),
         ("robot", {"robot": "cassie"}),

@@ -33,7 +33,7 @@ from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from tests.builders import bump, fresh_values, judged_archive, small_archive
+from tests.builders import bump, fresh_values, judged_archive, small_archive, steered_archive
 
 
 def pick_numbers(archive, *names):
@@ -280,6 +280,30 @@ def test_causes_are_by_number_and_the_unclear_last():
     assert summarise_search(ranked(one), one) == "The only terrain stops the robot"
     crossed = replace(alone, goal_rate=np.ones(6))
     assert summarise_search(ranked(crossed), crossed) == "The robot crosses all 6 terrains"
+
+
+def test_faults_by_ways_stand_beside_those_by_controllers():
+    archive = steered_archive()
+    names = ("certified", "faults", "faults_panel", "faults_controllers", "faults_witness", "strong")
+    assert pick_numbers(archive, *names) == (3, 2, 1, 1, 1, 0)
+    (witnesses,) = pick_numbers(archive, "witnesses")
+    assert witnesses == {"tried": 2, "around": 1, "beside": 0, "line": 1, "limit_m": 0.5}
+    sentences = [describe_judgement(archive, number)[-2:] for number in (1, 3)]
+    assert sentences[0][0] == "It is a fault: it can be crossed on the line."
+    assert sentences[0][1] == "Steered, at 0.5 m/s, this controller crosses it on the line, 17 of 20."
+    assert sentences[1][0] == "It is not confirmed, and not known to be passable on the line."
+    assert sentences[1][1] == "Steered, at 0.5 m/s, C-G crosses it by going round, 14 of 20."
+    archive = replace(archive, cause=np.array([""] * 5), family=np.arange(5))
+    crosses = "2 are faults: another controller of this robot, or one that is steered, crosses them"
+    assert summarise_search(ranked(archive), archive).endswith(crosses)
+    nobody = {"certifiers": (), "certifier_sha256": ()}
+    alone = replace(archive, **no_outcomes(5) | nobody | {"resolved_outcomes": archive.resolved_outcomes})
+    assert pick_numbers(alone, "faults", "faults_controllers", "faults_witness") == (1, 0, 1)
+    assert summarise_search(ranked(alone), alone).endswith("1 is a fault: a robot that is steered crosses it")
+    unconfirmed = replace(archive, **no_outcomes(5) | nobody)
+    assert summarise_search(ranked(unconfirmed), unconfirmed).endswith("a robot that is steered crosses 1 of them")
+    assert pick_numbers(unconfirmed, "certified", "confirmed", "faults") == (1, None, None)
+    assert "on the line, 17 of 20" in describe_judgement(unconfirmed, 1)[-1]
 
 
 def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():

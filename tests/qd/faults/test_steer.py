@@ -7,7 +7,7 @@ import pytest
 
 from kernels.episode import SEGMENTS, Outcome
 from qd.faults.numbers import describe_way
-from qd.faults.steer import SteerCfg, find_kinds, measure_line, seek_witnesses
+from qd.faults.steer import SteerCfg, find_kinds, measure_line, score_ways, seek_witnesses
 from sim.robots.find import get_robot
 from sim.terrains.terrains import Terrains
 from tests.qd.stand_in import result_of
@@ -22,8 +22,8 @@ class Planted:
         self.robot = get_robot("anymal")
         self.asked = []
 
-    def cross(self, policy, terrains, *, replicas, engine="search", label, invalid_ok):
-        self.asked.append((policy, engine, len(terrains), replicas, label))
+    def cross(self, policy, terrains, *, replicas, engine="search", label, invalid_ok, progress=None):
+        self.asked.append((policy, engine, len(terrains), replicas, label, progress is not None))
         steering = terrains.steering
         if steering is None:  # plain crossings of measure_line
             steering = np.full((len(terrains), replicas, SEGMENTS, 3), np.nan, np.float32)
@@ -67,8 +67,11 @@ def test_planted_terrains_get_the_right_word():
     assert 1.5 < witnesses.way[1, 5, 1] < 2.5 and 0.2 < witnesses.way[2, 5, 0] < 0.5
     assert (np.abs(witnesses.way[2, :, 1]) <= 0.5).all()
     # On the line all four in 12 generations; around, what it does not cross there.
-    searches = [row for row in crosser.asked if "of 12" in row[4]]
-    assert [count for _, _, count, *_ in searches] == [4] * 12 + [3] * 12
+    searches = [row for row in crosser.asked if row[-1]]  # in one bar each
+    assert [(row[2], row[4]) for row in searches] == [(4, "searched on the line")] * 12 + [(3, "searched around")] * 12
+    # Plain, steered, steered around, and both with contact resolved where the way led to the goal.
+    tries = [row[1:3] for row in crosser.asked if not row[-1]]
+    assert tries == [("search", 4), ("search", 4), ("search", 3), ("resolved", 2), ("resolved", 2)]
     goals, valid = witnesses.counts[2, :, 1, [0, 3]]
     assert valid.tolist() == [20, 20] and goals[0] == 20 and witnesses.counts[2, 0, 0].tolist() == [0, 0, 0, 20]
 
@@ -77,7 +80,7 @@ def test_another_walker_tries_only_what_has_no_witness_on_the_line():
     crosser, witnesses = seek([KERB, WALL, BRIDGE], {"searched": "plain", "C-G": "strong"})
     assert witnesses.kind.tolist() == [3, 0, 1] and witnesses.walker.tolist() == ["searched"] * 3
     first = next(row for row in crosser.asked if row[0] == "strong")
-    assert first[2] == 2 and first[4] == "C-G on the line, 1 of 12"
+    assert first[2] == 2 and first[4] == "C-G on the line"
 
 
 def counts_of(goals, plain=0, beside=None, resolved=None):
@@ -91,11 +94,11 @@ def test_kinds_by_hand():
     none = [[0, 0, 0, 20], [0, 0, 0, 0]]  # nobody crossed it with contact resolved
     rows = [
         counts_of(10), counts_of(9, beside=12), counts_of(9), counts_of(11, plain=9), counts_of(20, resolved=none),
-        counts_of(0),
+        counts_of(0), [[[0, 0, 0, 20], [14, 14, 14, 14]]] * 2,
     ]  # fmt: skip
-    # 10 of 20 against 0 of 20: p = C(20, 10) / C(40, 10) = 0.0002, times 6 / 2 under 0.05. Of the second 9 on the line
-    # are under half, 12 beside it are not. 11 against 9 is luck: p = 0.38.
-    assert find_kinds(np.array(rows)).tolist() == [3, 2, 0, 0, 0, 0]
+    # 10 of 20 against 0 of 20: p = C(20, 10) / C(40, 10) = 0.0002, times 7 / 2 under 0.05. Of the second 9 on the line
+    # are under half, 12 beside it are not. 11 against 9 is luck: p = 0.38. Of the last more than a quarter is invalid.
+    assert find_kinds(np.array(rows)).tolist() == [3, 2, 0, 0, 0, 0, 0]
     assert find_kinds(np.zeros((0, 2, 2, 4), np.int64)).tolist() == []
 
 
@@ -103,6 +106,12 @@ def test_the_plain_command_as_a_way_is_no_witness():
     goals = np.random.default_rng(3).binomial(20, 0.45, (1000, 2, 2))
     rows = [[counts_of(int(steered), plain=int(plain))[0] for plain, steered in both] for both in goals]
     assert not find_kinds(np.array(rows)).any()
+
+
+def test_a_slow_robot_that_arrives_has_a_better_way_than_one_that_does_not():
+    result = result_of([[Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]], duration_s=[[130.0, 90.0, 150.0]])
+    late, soon, never = score_ways(result, 150.0, None, SteerCfg())[0]
+    assert soon > late > 0.0 > never
 
 
 def test_the_line_is_as_wide_as_plain_crossings_need():
@@ -115,8 +124,8 @@ def test_the_line_is_as_wide_as_plain_crossings_need():
 def test_ways_in_words():
     way = np.zeros((SEGMENTS, 3), np.float32)
     way[:, 0] = 0.75
-    way[5, 0], way[4, 1] = 0.4, -0.3
-    assert describe_way(way) == "slowed to 0.4 m/s from x = 7 to 8 m and 0.3 m to the right from x = 6 to 7 m"
+    way[5, 0], way[4, 1], way[-1, 1] = 0.4, -0.3, 2.0  # in the last segment the robot is sent to the goal all the same
+    assert describe_way(way) == "slowed to 0.4 m/s from x = 7 to 8 m and 0.3 m to the right from x = 7 to 8 m"
     way[:, 1] = 0
     assert describe_way(way) == "slowed to 0.4 m/s from x = 7 to 8 m"
     way[:, 0] = np.linspace(0.9, 1.0, SEGMENTS)

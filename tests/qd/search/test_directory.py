@@ -9,7 +9,7 @@ import pytest
 
 from qd.search import directory
 from qd.search import settings as module
-from qd.search.archive import Archive, FreshValues, goal_rates, read_archive, write_archive
+from qd.search.archive import Archive, FreshValues, Witnesses, goal_rates, read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint
 from qd.search.directory import RunDirectory, claimed, find_run, output_folder, read_robot_archive, search_seed
 from qd.search.fitness import FitnessCfg
@@ -18,7 +18,7 @@ from qd.search.settings import as_settings, differences, is_searched, preset
 from sim.controllers.spec import controller_hash
 from sim.robots.find import get_robot
 from sim.robots.robot import ROBOTS, RobotCfg, robot_digest
-from tests.builders import fresh_values, judged_archive, small_archive, write_run
+from tests.builders import fresh_values, judged_archive, small_archive, steered_archive, write_run
 from tests.qd import stand_in
 from tests.qd.searches import CFG
 
@@ -160,18 +160,24 @@ def grouped_archive():
     return dataclasses.replace(judged_archive(), family=np.array([0, 1, 0, 2, 3]), cause=causes)
 
 
-@pytest.mark.parametrize("archive", [small_archive(0), small_archive(3), grouped_archive()], ids=["0", "3", "judged"])
+ARCHIVES = {"0": small_archive(0), "3": small_archive(3), "judged": grouped_archive(), "steered": steered_archive()}
+
+
+@pytest.mark.parametrize("archive", ARCHIVES.values(), ids=ARCHIVES.keys())
 def test_an_archive_comes_back_whole_and_equal_ones_have_equal_files(tmp_path, archive):
     for name in ("archive.npz", "again.npz"):
         write_archive(tmp_path / name, archive)
     assert (tmp_path / "archive.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
     stored = read_archive(tmp_path)
     for field in dataclasses.fields(Archive):
-        if field.name != "fresh":
+        if field.name not in ("fresh", "witnesses"):
             assert np.array_equal(getattr(stored, field.name), getattr(archive, field.name)), field.name
     assert (stored.fresh is None) == (archive.fresh is None)
     for field in dataclasses.fields(FreshValues) if archive.fresh else ():
         assert np.array_equal(getattr(stored.fresh, field.name), getattr(archive.fresh, field.name)), field.name
+    assert (stored.witnesses is None) == (archive.witnesses is None)
+    for field in dataclasses.fields(Witnesses) if archive.witnesses else ():
+        assert np.array_equal(getattr(stored.witnesses, field.name), getattr(archive.witnesses, field.name)), field.name
     with np.load(tmp_path / "archive.npz") as arrays:
         assert "confirmed" not in arrays or arrays["confirmed"].tolist() == archive.confirmed.tolist()
 
@@ -202,12 +208,16 @@ def test_corrected_elites_are_in_order_of_fresh_fitness_and_the_invalid_last():
         ("robot", np.array(["anymal"])),
         ("fitness", np.array(list("abcde"))),
         ("fitness", np.full(5, np.nan)),
+        ("witness_counts", None),
+        ("witness_kind", np.array([0, 3, 0, 4, 0])),
+        ("witness_way", np.zeros((5, 11, 3), np.float32)),
+        ("witness_way", np.full((5, 12, 3), np.nan, np.float32)),
     ],
 )
 def test_arrays_that_lack_or_are_of_another_shape_or_kind_are_refused_by_name(tmp_path, name, value):
     with pytest.raises(FileNotFoundError, match=r"archive\.npz"):
         read_archive(tmp_path / "archive.npz")
-    write_archive(tmp_path / "archive.npz", judged_archive())
+    write_archive(tmp_path / "archive.npz", steered_archive())
     with np.load(tmp_path / "archive.npz") as stored:
         arrays = {**stored, name: value}
     np.savez(tmp_path / "archive.npz", **{key: array for key, array in arrays.items() if array is not None})

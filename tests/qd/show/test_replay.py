@@ -28,7 +28,7 @@ from sim.terrains.bank import make_heights
 from sim.terrains.maps.heightmap import as_terrain, read_heightmap
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import GroundMaps, Terrains
-from tests.builders import fresh_values, small_archive, write_run
+from tests.builders import fresh_values, small_archive, steered_archive, write_run
 from tests.qd.recordings import FRAMES, make_run, minimal_of, recording_of, stand_in_cross
 from tests.qd.searches import CFG
 
@@ -142,6 +142,28 @@ def test_the_drawing_has_all_paths():
     assert axes.images[0].get_array().shape == (161, 321)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels[:4] == ["reached the goal (1)", "out of time (1)", "start", "goal"]
+
+
+def test_the_witness_of_an_elite_is_its_walker_steered(tmp_path, anymal):
+    file = str(anymal.panel / "C-G.pt")
+    hashes = {"certifiers": ("C-G", "S"), "certifier_sha256": (str(controller_hash(file)), "b" * 64)}
+    archive = dataclasses.replace(steered_archive(), **hashes, policy_sha256=controller_hash(anymal.policy_file))
+    run = OpenedRun(path=tmp_path, archive=archive, robot=anymal)
+
+    def requests(elite, **crossing):
+        return source_from_run(run, elite, **crossing).steered_requests()
+
+    # By the searched controller and by C-G, whoever else crosses the elites here.
+    for policy in (None, STAND):
+        searched, other = requests("1 3", policy=policy, replicas=4)
+        assert (searched.policy, other.policy) == (str(anymal.policy_file), file)
+        assert np.array_equal(other.terrain.steering, np.tile(archive.witnesses.way[3], (1, 4, 1, 1)))
+        assert np.array_equal(other.terrain.genes[0], archive.genes[3])
+    with pytest.raises(ValueError, match=r"witness .*elite 0"):
+        requests("0")
+    lost = dataclasses.replace(archive, certifier_sha256=("a" * 64, "b" * 64))
+    with pytest.raises(ValueError, match="C-G, got no file"):
+        source_from_run(OpenedRun(path=tmp_path, archive=lost, robot=anymal), "3").steered_requests()
 
 
 def test_a_map_is_never_overwritten(anymal):
