@@ -147,9 +147,7 @@ def find_ways(
     offset = limit_m or CrossingCfg.goal[1]
     low = [CrossingCfg.lowest_command[0], -offset, -np.pi / 2]
     high = [CrossingCfg.highest_command[0], offset, np.pi / 2]
-    apart = np.subtract.outer(np.arange(SEGMENTS), np.arange(SEGMENTS))
-    covariance = cfg.common + (1.0 - cfg.common) * np.exp(-0.5 * (apart / cfg.smooth) ** 2)
-    mix = np.linalg.cholesky(covariance + 1e-6 * np.eye(SEGMENTS))
+    mix = mix_segments(SEGMENTS, cfg)
     with Bar(label, cfg.generations) as bar:
         for generation in range(cfg.generations):
             noise = rng.standard_normal((shape[0], cfg.samples, *shape[1:]))
@@ -157,13 +155,30 @@ def find_ways(
             drawn, move = seeds[:, generation], bar.within(generation, 1.0)
             result = cross_ways(crosser, policy, terrains, ways, drawn, label=label, progress=move)
             score = score_ways(result, crosser.robot.max_duration_s, limit_m, cfg)
-            order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
-            best = np.take_along_axis(ways, order[..., None, None], axis=1)
-            mean += cfg.step * (best.mean(axis=1) - mean)
-            arrives = score.max(axis=1) > 0.0  # else the next generation is drawn as widely
-            std[arrives] += cfg.step * (best[arrives].std(axis=1) - std[arrives])
-            std = np.maximum(std, cfg.least_std)
+            mean, std = move_to_best(mean, std, ways, score, cfg)
     return mean.astype(np.float32)
+
+
+def mix_segments(count: int, cfg: SteerCfg) -> NDArray[np.floating]:
+    """What makes independent noise of segments correlated noise, shape (count, count)."""
+    apart = np.subtract.outer(np.arange(count), np.arange(count))
+    covariance = cfg.common + (1.0 - cfg.common) * np.exp(-0.5 * (apart / cfg.smooth) ** 2)
+    return np.linalg.cholesky(covariance + 1e-6 * np.eye(count))
+
+
+def move_to_best(
+    mean: NDArray[np.floating], std: NDArray[np.floating], samples: NDArray[np.floating], score: NDArray[np.floating],
+    cfg: SteerCfg,
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:  # fmt: skip
+    """Mean and deviation of the next generation of T terrains, shape (T, ...): those of this one, moved to the best.
+
+    Samples have shape (T, S, ...) and scores (T, S).
+    """
+    order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
+    best = np.take_along_axis(samples, order.reshape(*order.shape, *[1] * (mean.ndim - 1)), axis=1)
+    arrives = (score.max(axis=1) > 0.0).reshape(-1, *[1] * (mean.ndim - 1))  # else it is drawn as widely
+    narrower = np.where(arrives, std + cfg.step * (best.std(axis=1) - std), std)
+    return mean + cfg.step * (best.mean(axis=1) - mean), np.maximum(narrower, cfg.least_std)
 
 
 def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
@@ -197,8 +212,13 @@ def try_ways(
 
     Shape (T, 4).
     """
-    limits = (limit_m, max(limit_m, BESIDE_M), np.inf)
     result = cross_ways(crosser, policy, terrains, np.repeat(ways[:, None], EPISODES, axis=1), seeds, label, engine)
+    return count_goals(result, limit_m)
+
+
+def count_goals(result: RolloutResult, limit_m: float) -> NDArray[np.int64]:
+    """Episodes of T terrains that reach the goal on the line, beside it, and at all, and valid ones, shape (T, 4)."""
+    limits = (limit_m, max(limit_m, BESIDE_M), np.inf)
     reached = [(result.reached_goal & (result.deviation <= limit)).sum(axis=1) for limit in limits]
     return np.stack([*reached, (~result.invalid).sum(axis=1)], axis=1)
 

@@ -25,8 +25,10 @@ for robot in "${robots[@]}"; do
     make_file "$folder/$part/curve.json" archive "$robot"             # 60 min: four searches, two of them judged
   done
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
+  make_file "$folder/residual.json" residual "$robot"                 # 6 min
   make_file "$folder/agreement.json" agreement "$robot"               # 15 min, most of it MuJoCo C on 16 cores
   make_file "$folder/search.json" search "$robot"                     # 70 min: 17 searches
+  make_file "$folder/left.json" left "$robot"                         # 10 min: two searches beside those of search
   make_file "$folder/search_noise.json" search_noise "$robot"         # 40 min: 18 searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
   make_file "$folder/recipes.json" recipes "$robot"                   # 10 min: three trainings

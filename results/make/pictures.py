@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from qd.faults.families import KIN_M
 from qd.faults.searches import controllers_in
 from qd.show.crossed import find_typical_episode, make_title
 from qd.show.elites import open_run
@@ -108,6 +109,33 @@ def draw_growth() -> Figure:
     return figure
 
 
+def draw_left() -> Figure | None:
+    """Groups of failing elites and of faults over the searches that see them, and Chao2; None without left.json."""
+    files = {words: content for robot, words in ROBOTS.items() if (content := read(f"results/{robot}/left.json"))}
+    if not files:
+        print("No results/<robot>/left.json is here: left.png stays as it is.")
+        return None
+    figure = new_figure(12, 6.0)
+    grid = figure.subplots(2, len(files), sharex=True, squeeze=False)
+    for column, (robot, content) in zip(grid.T, files.items(), strict=True):
+        for axes, (name, words) in zip(column, {"failing": "failing elites", "faults": "faults"}.items(), strict=True):
+            axes.set(title=f"{robot}: {words}", ylabel="groups", yscale="log")
+            for number, (least, numbers) in enumerate(content[name]["distances"].items()):
+                searches, color = np.arange(1, len(numbers["growth"]) + 1), f"C{number}"
+                label = f"{100 * KIN_M * float(least):.0f} cm apart"
+                axes.plot(searches, numbers["growth"], marker=".", color=color, label=f"seen, {label}")
+                axes.axhline(numbers["chao2"], ls="--", color=color, label=f"lower bound (Chao2), {label}")
+                if numbers["chao2_interval"]:
+                    axes.axhspan(*numbers["chao2_interval"], color=color, alpha=0.12, lw=0)
+            axes.yaxis.set_major_formatter("{x:,.0f}")
+            axes.set_xticks(searches)
+            axes.grid(alpha=0.3)
+        column[-1].set_xlabel("searches")
+    title = "lower bounds for what this search can find"
+    figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside right center", title=title)
+    return figure
+
+
 def main() -> None:
     """Makes the pictures that the command line names, all without any."""
     wanted = sys.argv[1:] or ["film", "stills", "pages", "curves"]
@@ -121,6 +149,8 @@ def main() -> None:
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
         save_figure(FOLDER / "growth.png", draw_growth())
+        if (figure := draw_left()) is not None:
+            save_figure(FOLDER / "left.png", figure)
     if "pages" in wanted:
         subprocess.run([sys.executable, "-m", "tests.qd.show.view.browser"], check=True)
 

@@ -8,6 +8,7 @@ when all others were done.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,10 +31,15 @@ STEPS = (96_000, 192_000, 384_000)
 """Episodes after which elites cross fresh ones."""
 
 
+def run_of(script: Script, method: str, seed: int) -> Path:
+    """The run of a search."""
+    return script.runs / "search" / file_name(f"{method}, seed {seed}")
+
+
 def follow(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     """Counts of a search after each step; the last ones with the origin of the search."""
     cfg = script.search_cfg(seed=seed, **({} if script.small else METHODS[method]))
-    run = script.runs / "search" / file_name(f"{method}, seed {seed}")
+    run = run_of(script, method, seed)
     points, stages = script.count_iterations(cfg, *STEPS), ("fresh", "resolved", "others")
     *rows, last = follow_search(script, run, cfg, points, COUNTS, stages)
     origin = script.read_so_far(run / common.CURVE_FILE)

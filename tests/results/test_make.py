@@ -28,6 +28,7 @@ SCRIPTS = (
     "base",
     "conditions",
     "dose",
+    "left",
     "minimal",
     "pack",
     "penalty_ratios",
