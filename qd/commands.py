@@ -201,7 +201,8 @@ class JudgeCommand(_RunFlags):
             report_level_ground(searched.robot, searched.policy, named["compute"], must_walk=True)
         most = self.steered or (None if named["compute"].on_gpu else 20)
         archive = judge(run, stages=self.stages, most_steered=most, **named)
-        print_summary(run, archive, robot=self.robot, policy=self.policy, space=self.space)
+        own = {"robot": self.robot, "policy": self.policy, "space": self.space}
+        print_summary(run, archive, **own, skip_level_ground=self.skip_level_ground)
 
 
 @dataclass(frozen=True, kw_only=True)

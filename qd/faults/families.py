@@ -303,6 +303,6 @@ def summarise_search(ranking: Ranking, archive: Archive) -> str:
     among = archive.is_fault if archive.is_fault.any() else archive.certified
     judged = {"asked": asked, "certified": archive.certified.sum()}
     judged["others"] = archive.certified_by_controllers[among].any()
-    judged["steered"] = not archive.certified_by_controllers[among].all()
+    judged["steered"] = not archive.certifiers or not archive.certified_by_controllers[among].all()
     counts = {"count": len(ranking), "failing": failing, "faults": count_faults(archive), **judged}
     return TEMPLATES.get_template("summary.txt").render(cause="" if commonest == UNCLEAR else cause, **counts)

@@ -156,6 +156,7 @@ def print_summary(
         return
     number = ranking.worst(1)[0]
     flags = {"run": run, "robot": robot, "space": space}
+    judge = {**flags, "policy": policy, "skip_level_ground": skip_level_ground}
     text = _TEMPLATES.get_template("summary.txt").render(
         archive=archive,
         ranking=ranking,
@@ -165,7 +166,8 @@ def print_summary(
         view=command_line("view", **flags, policies=[f"searched={policy}"] if policy else []),
         report=command_line("report", **flags, policy=policy),
         replay=command_line("replay", **flags, elite=number, policy=policy),
-        judge=command_line("judge", **flags, policy=policy, skip_level_ground=skip_level_ground),
+        judge=command_line("judge", **judge),
+        steered=command_line("judge", **judge, stages="steered"),
         finetune=command_line("finetune", robot=robot, specialist=run, policy=policy, space=space),
     )
     console = Console(highlight=False)

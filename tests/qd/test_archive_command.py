@@ -168,7 +168,9 @@ def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(ca
     assert following == f"Next: {view}, {report} or faultline replay {run} --elite {number} --policy {fine}"
     assert judging.startswith(f"faultline judge {run} --policy {fine} ")
     print_summary(Path("a b"), replace(found, fresh=fresh_values(found)), policy=fine)
-    assert f"faultline finetune --specialist 'a b' --policy {fine} trains" in capsys.readouterr().out
+    judged = capsys.readouterr().out
+    assert f"faultline finetune --specialist 'a b' --policy {fine} trains" in judged
+    assert f"faultline judge {run} --policy {fine} --stages steered looks" in judged
     print_summary(Path("a b"), found, skip_level_ground=True)
     assert "faultline judge --run 'a b' --skip-level-ground says" in " ".join(capsys.readouterr().out.split())
 

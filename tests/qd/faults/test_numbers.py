@@ -28,7 +28,7 @@ from qd.faults.numbers import (
     judgement,
     rate_numbers,
 )
-from qd.search.archive import no_outcomes
+from qd.search.archive import no_outcomes, no_witnesses
 from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
 from sim.terrains.spaces.registry import get_space
@@ -304,6 +304,8 @@ def test_faults_by_ways_stand_beside_those_by_controllers():
     assert summarise_search(ranked(unconfirmed), unconfirmed).endswith("a robot that is steered crosses 1 of them")
     assert pick_numbers(unconfirmed, "certified", "confirmed", "faults") == (1, None, None)
     assert "on the line, 17 of 20" in describe_judgement(unconfirmed, 1)[-1]
+    nowhere = replace(unconfirmed, witnesses=no_witnesses(5, 0.5))
+    assert summarise_search(ranked(nowhere), nowhere).endswith("a robot that is steered crosses none of them")
 
 
 def test_without_a_minimal_terrain_the_part_where_the_typical_episode_ends_is_the_cause():
