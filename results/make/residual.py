@@ -26,7 +26,7 @@ from qd.search.archive import WITNESSES, Archive
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.seeds import Stream
 from results.make.common import Script, parse
-from sim.controllers.loaders import Policy, load_policy
+from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import Memory, find_memory
 from sim.crossing import CrossingCfg, SolverCfg, resolved
 from sim.robots.robot import RobotCfg
@@ -97,6 +97,7 @@ class Crossings:
 
     def __init__(self, script: Script, terrains: Terrains, replicas: int, *, fine: bool = False) -> None:
         robot, solver = resolved(script.robot) if fine else (script.robot, SolverCfg())
+        prepare_torch(script.device)
         self._policy = OffsetPolicy(load_policy(script.policy, script.robot, script.device), robot)
         self._terrains, self._replicas = terrains, replicas
         self._rollout = Rollout(
