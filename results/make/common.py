@@ -47,8 +47,8 @@ FRESH_COUNTS = (
 )  # fmt: skip
 """What archive.json counts once fresh episodes are crossed."""
 COUNTS = (
-    *FRESH_COUNTS, "confirmed", "certified", "faults", "faults_panel", "fault_families", "faults_distinct", "strong",
-    "faults_fdr",
+    *FRESH_COUNTS, "confirmed", "certified", "faults", "faults_panel", "faults_controllers", "faults_witness",
+    "fault_families", "faults_distinct", "strong", "faults_fdr",
 )  # fmt: skip
 """... once contact is resolved and others have crossed what fails, too."""
 ARCHIVE_FILES = ("archive.npz", "archive.json", "config.json")

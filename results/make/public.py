@@ -142,7 +142,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     terrains = 1 if small else None
     dose = measure_dose(robot, {name: policy}, doses, compute=compute, terrains=terrains, seed=seed, out=out)
     space = fitting_space(robot) or SUPER_GAUSSIAN.name
-    iterations, stages = (1, ("fresh",)) if small else (ITERATIONS, ("fresh", "resolved"))
+    iterations, stages = (1, ("fresh",)) if small else (ITERATIONS, ("fresh", "resolved", "steered"))
     ranking, counts = search_at(
         robot, space, run, compute, seed=seed, small=small, iterations=iterations, stages=stages
     )
@@ -176,7 +176,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
         "half": dose["half"],
         "archive": counts,
         "failing_families": counts["failing_families"],
-        "faults_witness": None,
+        "faults_witness": counts["faults_witness"],
         "causes": {cause: len(rows) for cause, rows in ranking.by_cause().items()},
         "minimal": worst,
     }

@@ -1,0 +1,120 @@
+"""Witnesses of the published archives: results/<robot>/witness.json; archives are judged anew by the stage steered.
+
+``control`` are plain crossings in place of steered ones: how many would pass for witnesses by luck. ``curve`` says how
+many of some terrains a search crosses in half of 20 coarse episodes, over the episodes that it spends on each.
+"""
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from qd.faults.judge import elite_seeds, judge
+from qd.faults.steer import SteerCfg, find_kinds, find_ways, try_ways
+from qd.search.archive import WITNESSES, Archive
+from qd.search.directory import RunDirectory
+from qd.search.fitness import FAILING_GOAL_RATE
+from qd.workers.crosser import Crosser
+from qd.workers.seeds import Stream
+from results.make.common import ARCHIVE_FILES, Script, parse
+from sim.terrains.spaces.registry import get_space
+from sim.terrains.terrains import Terrains
+
+ARCHIVES = ("archive", "archive_cma_mae")
+GENERATIONS = (1, 2, 4, 8, 12, 16, 24)
+CURVE_TERRAINS = 200
+_COUNTS = (
+    "failing", "confirmed", "certified", "faults", "faults_panel", "faults_controllers", "faults_witness",
+    "fault_families", "faults_distinct", "failing_families", "failing_distinct", "witnesses",
+)  # fmt: skip
+
+
+def judge_steered(script: Script, name: str) -> tuple[Archive, dict[str, Any]]:
+    """The archive with its witnesses, judged in a copy of the published run, which it replaces; and its numbers."""
+    run = script.runs / "witness" / name
+    if not run.exists():
+        shutil.copytree(script.results / name, run)
+    began = time.perf_counter()
+    archive = judge(run, stages=("steered",), compute=script.compute, most_steered=2 if script.small else None)
+    seconds = time.perf_counter() - began
+    witnesses = archive.witnesses
+    assert witnesses is not None
+    by_walker = {
+        str(walker): {
+            word: int(((witnesses.walker == walker) & (witnesses.kind == kind)).sum()) for kind, word in _KINDS
+        }
+        for walker in np.unique(witnesses.walker[witnesses.kind > 0])
+    }
+    summary = RunDirectory(run).read_summary()
+    if not script.small:
+        script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
+    return archive, {count: summary.get(count) for count in _COUNTS} | {"by_walker": by_walker, "wall_s": seconds}
+
+
+_KINDS = [(kind, word) for kind, word in enumerate(WITNESSES) if word]
+
+
+def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np.ndarray) -> dict[str, Any]:
+    """How many of the terrains have a witness by luck, where other plain episodes stand for steered ones."""
+    terrains, seeds = elites_to_steer(archive, rows, script.seed, 4)
+    assert archive.witnesses is not None
+    way = np.full_like(archive.witnesses.way[rows], np.nan)
+    limit_m = archive.witnesses.limit_m
+    counts = np.zeros((len(rows), 2, 2, 4), np.int64)
+    for kind, engine in enumerate(("search", "resolved")):
+        for side in range(2):
+            drawn = seeds[:, 2 * kind + side]
+            counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, "control", engine)[
+                :, 0
+            ]
+    found = find_kinds(counts)
+    return {"tried": len(rows)} | {word: int((found == kind).sum()) for kind, word in _KINDS}
+
+
+def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.ndarray) -> list[dict[str, Any]]:
+    """Shares of some terrains that a search crosses in half of 20 coarse episodes: on the line, beside it, around."""
+    assert archive.witnesses is not None
+    limit_m, points = archive.witnesses.limit_m, []
+    for generations in GENERATIONS[:1] if script.small else GENERATIONS:
+        cfg = replace(SteerCfg(), generations=generations)
+        for limit in (limit_m, None):
+            terrains, seeds = elites_to_steer(archive, rows, script.seed + 1, generations + 1)
+            rng = np.random.default_rng(script.seed)
+            ways = find_ways(
+                crosser, script.policy, terrains, seeds[:, :-1], limit_m=limit, rng=rng, label="curve", cfg=cfg
+            )
+            counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, "curve")[:, 1]
+            crossed = counts[:, :3] >= FAILING_GOAL_RATE * np.maximum(counts[:, 3:], 1)
+            words = dict(zip(("line", "beside", "around"), crossed.mean(axis=0).tolist(), strict=True))
+            points.append({"episodes": generations * cfg.samples, "limit_m": limit, "terrains": len(rows), **words})
+    return points
+
+
+def elites_to_steer(archive: Archive, rows: np.ndarray, seed: int, times: int) -> tuple[Terrains, np.ndarray]:
+    """Some elites as terrains, and seeds of so many evaluations of each, (N, times)."""
+    seeds = elite_seeds(archive, seed, times, stream=Stream.STEERED).reshape(-1, times)[rows]
+    space = get_space(archive.space, archive.space_sha256)
+    return Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=space), seeds
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Judges, and measures what luck finds and how much search pays."""
+    script = parse(__doc__, argv, "witness.json")
+    archives = {name: judge_steered(script, name) for name in ARCHIVES[: 1 if script.small else None]}
+    archive = archives["archive"][0]
+    assert archive.witnesses is not None
+    tried = np.flatnonzero(archive.witnesses.walker != "")
+    some = np.random.default_rng(script.seed).permutation(tried)[: 2 if script.small else CURVE_TERRAINS]
+    with Crosser(script.robot, script.compute) as crosser:
+        control = measure_control(script, crosser, archive, tried)
+        curve = measure_curve(script, crosser, archive, np.sort(some))
+    return script.write(
+        {"archives": {n: numbers for n, (_, numbers) in archives.items()}, "control": control, "curve": curve}
+    )
+
+
+if __name__ == "__main__":
+    main()
