@@ -82,10 +82,12 @@ class Judging:
         seeds = elite_seeds(archive, self.search.cfg.seed, stream=stream)
         return Terrains(genes=archive.genes[rows], seeds=seeds[rows], space=self.search.space)
 
-    def count(self, policy: str, terrains: Terrains, label: str, **settings: Any) -> NDArray[np.int64]:
+    def count(
+        self, policy: str, terrains: Terrains, label: str, *, limit_m: float = np.inf, **settings: Any
+    ) -> NDArray[np.int64]:
         """Outcomes on terrains, (num_terrains, 4), of 20 episodes each unless ``settings`` of Crosser.cross differ."""
         settings = {"replicas": EPISODES, **settings, "invalid_ok": True, "label": self.step + label}
-        return count_outcomes(self.crosser.cross(policy, terrains, **settings))
+        return count_outcomes(self.crosser.cross(policy, terrains, **settings), limit_m)
 
 
 @contextmanager
@@ -111,9 +113,12 @@ def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> 
     return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
 
 
-def count_outcomes(result: RolloutResult) -> NDArray[np.int64]:
-    """Episodes of each terrain by :data:`qd.search.archive.OUTCOMES`, shape (num_terrains, 4)."""
-    flags = (result.reached_goal, result.base_collision, result.invalid)
+def count_outcomes(result: RolloutResult, limit_m: float = np.inf) -> NDArray[np.int64]:
+    """Episodes of each terrain by :data:`qd.search.archive.OUTCOMES`, shape (num_terrains, 4).
+
+    Those that were further than ``limit_m`` from the straight line have not reached the goal.
+    """
+    flags = (result.reached_goal & (result.deviation <= limit_m), result.base_collision, result.invalid)
     goal, collided, invalid = (flag.sum(axis=1) for flag in flags)
     return np.stack([goal, collided, result.invalid.shape[1] - goal - collided - invalid, invalid], axis=1)
 
@@ -255,14 +260,18 @@ class OfFaults(Stage):
     """A stage in which the controller and certifiers cross faults again."""
 
     asks_certifiers = True
+    crosses_steered = False
+    """Whether faults that a witness alone certifies are crossed, too."""
 
     def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
         """Refuses a search without faults, and certifiers that are not at hand."""
         super().check(archive, judging, before)
-        faults = archive.certified_by_controllers & (archive.confirmed | ("resolved" in before))
-        if "others" not in before and ("fresh" in before or not faults.any()):
-            rule = f"stages must have others before {self.name}"
-            raise ValueError(f"{rule}: {judging.search.run} has no faults that another controller crosses")
+        certified = archive.certified if self.crosses_steered else archive.certified_by_controllers
+        faults = certified & (archive.confirmed | ("resolved" in before))
+        certifying = {"others", "steered"} if self.crosses_steered else {"others"}
+        if certifying.isdisjoint(before) and ("fresh" in before or not faults.any()):
+            rule = f"stages must have {' or '.join(sorted(certifying))} before {self.name}"
+            raise ValueError(f"{rule}: {judging.search.run} has no faults that it can cross")
         self._check_certifiers(archive, judging, renewed="others" in before)
 
     @staticmethod
@@ -328,6 +337,7 @@ class InMujocoC(OfFaults):
     """
 
     name = "mujoco_c"
+    crosses_steered = True
     faults = 150
     episodes = (6, 4)
 
@@ -344,13 +354,16 @@ class InMujocoC(OfFaults):
         rounds = len(self.episodes)
         seeds = elite_seeds(archive, search.cfg.seed, rounds, stream=Stream.MUJOCO_C).reshape(-1, rounds)
 
-        def cross(policy: str, rows: NDArray[np.int64], name: str) -> NDArray[np.int64]:
+        def cross(policy: str, rows: NDArray[np.int64], name: str, ways: Any = None, **how: Any) -> NDArray[np.int64]:
             outcomes = np.zeros((len(rows), len(OUTCOMES)), np.int64)
             for number, replicas in enumerate(self.episodes):
                 undecided = ~is_decided(outcomes, sum(self.episodes))
                 chosen = rows[undecided]
-                terrains = Terrains(genes=archive.genes[chosen], seeds=seeds[chosen, number], space=search.space)
-                how: dict[str, Any] = {"replicas": replicas, "engine": "mujoco_c"}
+                steering = None if ways is None else np.repeat(ways[undecided][:, None], replicas, axis=1)
+                terrains = Terrains(
+                    genes=archive.genes[chosen], seeds=seeds[chosen, number], space=search.space, steering=steering
+                )
+                how |= {"replicas": replicas, "engine": "mujoco_c"}
                 outcomes[undecided] += judging.count(policy, terrains, f"{name} in MuJoCo C", **how)
             return outcomes
 
@@ -359,19 +372,28 @@ class InMujocoC(OfFaults):
         outcomes[rows] = cross(search.policy, rows, "searched")
         others = np.zeros_like(archive.certifier_outcomes)
         failing = rows[goal_rates(outcomes[rows]) < FAILING_GOAL_RATE]
-        best = np.array([best_certifier(archive, row) for row in failing.tolist()], np.str_)
+        best = np.array([best_certifier(archive, row) or "" for row in failing.tolist()], np.str_)
         for column, name in enumerate(archive.certifiers):
             if (best == name).any():
                 others[failing[best == name], column] = cross(judging.certifiers[name], failing[best == name], name)
-        archive = replace(archive, mujoco_c_outcomes=outcomes, certifier_mujoco_c_outcomes=others)
+        steered = np.zeros_like(outcomes)
+        if (witnesses := archive.witnesses) is not None:
+            failing = failing[~archive.certified_by_controllers[failing]]
+            walkers = {SEARCHED: search.policy, **judging.certifiers}
+            for name in np.unique(witnesses.walker[failing]).tolist():
+                rows_of = failing[witnesses.walker[failing] == name]
+                ways, limit_m = witnesses.way[rows_of], witnesses.limit_m
+                steered[rows_of] = cross(walkers[name], rows_of, f"{name} steered", ways, limit_m=limit_m)
+        columns = {"certifier_mujoco_c_outcomes": others, "steered_mujoco_c_outcomes": steered}
+        archive = replace(archive, mujoco_c_outcomes=outcomes, **columns)
         print(f"{archive.holds_in_mujoco_c.sum()} of {len(rows)} faults hold in MuJoCo C.", flush=True)
         return archive
 
 
 def draw_faults(archive: Archive, seed: int, count: int) -> NDArray[np.int64]:
-    """Rows of at most ``count`` random faults with a certificate, a fault of each family before a second one of any."""
+    """Rows of at most ``count`` random faults, a fault of each family before a second one of any."""
     rng = np.random.default_rng(np.random.SeedSequence([seed], spawn_key=(Stream.MUJOCO_C,)))
-    rows = rng.permutation(np.flatnonzero(archive.is_fault & archive.certificates.any(axis=1)))
+    rows = rng.permutation(np.flatnonzero(archive.is_fault))
     assert archive.family is not None
     _, first = np.unique(archive.family[rows], return_index=True)
     return np.concatenate([rng.permutation(rows[first]), np.delete(rows, first)])[:count]

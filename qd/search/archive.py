@@ -174,6 +174,8 @@ class Archive(Evaluation, Subject):
     # In MuJoCo C with contact resolved, of some faults and a certifier each, until decided; None before.
     mujoco_c_outcomes: NDArray[np.int64] | None = None
     certifier_mujoco_c_outcomes: NDArray[np.int64] | None = None
+    steered_mujoco_c_outcomes: NDArray[np.int64] | None = None
+    """Of witnesses on the line; what leaves it does not count as the goal."""
 
     def __len__(self) -> int:
         return len(self.fitness)
@@ -251,16 +253,23 @@ class Archive(Evaluation, Subject):
     @property
     def holds_in_mujoco_c(self) -> NDArray[np.bool_]:
         """Whether a fault is one in MuJoCo C too, shape (N,)."""
-        return self._is_fault_by(self.mujoco_c_outcomes, self.certifier_mujoco_c_outcomes)
+        steered = self.steered_mujoco_c_outcomes
+        return self._is_fault_by(self.mujoco_c_outcomes, self.certifier_mujoco_c_outcomes, steered)
 
     def _is_fault_by(
-        self, outcomes: NDArray[np.int64] | None, certifier_outcomes: NDArray[np.int64] | None
+        self,
+        outcomes: NDArray[np.int64] | None,
+        certifier_outcomes: NDArray[np.int64] | None,
+        steered: NDArray[np.int64] | None = None,
     ) -> NDArray[np.bool_]:
-        """Faults of which the controller crosses under half by other outcomes, and one with a certificate half."""
+        """Faults of which the controller crosses under half by other outcomes, and what certifies it at least half."""
         if outcomes is None or certifier_outcomes is None:
             return np.zeros(len(self), bool)
         crosses = self.certificates & (goal_rates(certifier_outcomes) >= FAILING_GOAL_RATE)
-        return self.is_fault & (goal_rates(outcomes) < FAILING_GOAL_RATE) & crosses.any(axis=1)
+        can_be_crossed = crosses.any(axis=1)
+        if steered is not None:
+            can_be_crossed |= goal_rates(steered) >= FAILING_GOAL_RATE
+        return self.is_fault & (goal_rates(outcomes) < FAILING_GOAL_RATE) & can_be_crossed
 
     @property
     def is_judged(self) -> bool:
@@ -303,7 +312,7 @@ _WITNESS = "witness_"
 _STEERED = {f"{_WITNESS}{name}": shape for name, shape in {"walker": "N", "kind": "N", "way": "NS3"}.items()}
 _STEERED |= {f"{_WITNESS}counts": "N224", f"{_WITNESS}limit_m": ""}
 _VARIED = {"varied_outcomes": "N4", "certifier_varied_outcomes": "NC4"}
-_MUJOCO_C = {"mujoco_c_outcomes": "N4", "certifier_mujoco_c_outcomes": "NC4"}
+_MUJOCO_C = {"mujoco_c_outcomes": "N4", "certifier_mujoco_c_outcomes": "NC4", "steered_mujoco_c_outcomes": "N4"}
 _BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _STEERED, _VARIED, _MUJOCO_C)  # groups that a file has whole, or not at all
 _TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause", "witness_walker"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}

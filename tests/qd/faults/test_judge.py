@@ -320,9 +320,19 @@ def test_faults_by_ways_alone_are_not_crossed_by_certifiers_again(path, monkeypa
     assert [*walkers] == ["searched"] and len(genes) == archive.failing.sum()
     assert numbers_in(path)["certified"] == len(genes) and np.array_equal(read_archive(path).certified, archive.failing)
     assert judged(path, stages=("resolved",), certifiers={}).is_fault.any()
-    for stage in ("varied", "mujoco_c"):
-        with pytest.raises(ValueError, match=r"stages .* no faults"):
-            judged(path, Robots(cross_by_genes, stop_after=0), stages=(stage,), certifiers={})
+    with pytest.raises(ValueError, match=r"stages .* no faults"):
+        judged(path, Robots(cross_by_genes, stop_after=0), stages=("varied",), certifiers={})
+
+
+def test_mujoco_c_steers_where_a_way_certifies(path, monkeypatch):
+    before = judged(path)
+    archive, _ = witnessed(path, monkeypatch, (3, 0))
+    by_ways = archive.is_fault & ~before.is_fault
+    robots = Robots(lambda cfg, genes, seeds: np.full(len(genes), not (cfg.with_steering or "C-G" in cfg.policy)))
+    held = judged(path, robots, stages=("mujoco_c",))
+    assert by_ways.any() and held.holds_in_mujoco_c.tolist() == held.is_fault.tolist()
+    assert held.steered_mujoco_c_outcomes.tolist() == np.where(by_ways[:, None], [6, 0, 0, 0], 0).tolist()
+    assert np.array_equal(read_archive(path).steered_mujoco_c_outcomes, held.steered_mujoco_c_outcomes)
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):
