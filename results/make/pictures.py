@@ -41,7 +41,7 @@ def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]
     robot = get_robot(named)
     source = source_from_map(FOLDER / file, robot)
     (recording,) = source.record("cpu")
-    other = (beside, source.record("cpu", controllers_in(robot.panel)[beside])[0]) if beside else None
+    other = (beside, source.record("cpu", source.requests(controllers_in(robot.panel)[beside]))[0]) if beside else None
     episode, title = find_typical_episode(recording, source.scales), make_title(replace(recording, labels=(words,)))
     shot = Shot(recording=recording, episode=episode, title=title, beside=other)
     return [*render_pictures(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]
