@@ -9,7 +9,7 @@ import torch
 from kernels.episode import Outcome
 from qd.faults.steer import SteerCfg
 from results.make import residual
-from results.make.residual import OffsetPolicy, find_offsets, find_open, seek_offsets
+from results.make.residual import OffsetPolicy, cross_half, find_offsets, find_open, seek_offsets
 from sim.controllers.runner import Memory, find_memory
 from sim.robots.find import get_robot
 from tests.builders import judged_archive
@@ -75,23 +75,30 @@ def test_the_controllers_action_is_shifted_by_the_episodes_genes(monkeypatch):
 
 
 def test_the_search_finds_offsets_that_are_planted():
-    """One terrain is crossed where the second joint is bent by over .15 rad at the third knot, another never."""
+    """One terrain is crossed where the second joint is bent by over .15 rad at the third knot; one never, one aside."""
 
     def cross(genes, seeds):
-        bend = genes[..., :-1].reshape(2, -1, 6, JOINTS)[:, :, 2, 1]
-        crosses = (bend > 0.15) & np.array([[True], [False]])
+        bend = genes[..., :-1].reshape(3, -1, 6, JOINTS)[:, :, 2, 1]
+        crosses = bend > np.array([[0.15], [np.inf], [-np.inf]])
         end = np.zeros((*bend.shape, 3))
         end[..., 0] = np.where(crosses, 13.6, 7.0 + np.minimum(bend, 0.15))
-        return result_of(np.where(crosses, Outcome.GOAL, Outcome.TIME_OUT), final_position=end)
+        result = result_of(np.where(crosses, Outcome.GOAL, Outcome.TIME_OUT), final_position=end)
+        return replace(result, deviation=np.array([[0.4], [0.0], [0.6]]) + 0.0 * bend)
 
     cfg = SteerCfg(generations=8, samples=32, least_std=0.02)
     robot = replace(get_robot("anymal"), joint_names=("hip", "knee"))
-    rng, seeds = np.random.default_rng(0), np.zeros((2, 8), np.uint32)
-    genes, curve = seek_offsets(cross, seeds, 1, robot, rng=rng, cfg=cfg)
-    assert genes.shape == (2, 6 * JOINTS + 1) and genes[0, :-1].reshape(6, JOINTS)[2, 1] > 0.15
+    rng, seeds = np.random.default_rng(0), np.zeros((3, 8), np.uint32)
+    genes, curve = seek_offsets(cross, seeds, 1, robot, 0.5, rng=rng, cfg=cfg)
+    assert genes.shape == (3, 6 * JOINTS + 1) and genes[0, :-1].reshape(6, JOINTS)[2, 1] > 0.15
     assert np.abs(genes[:, :-1]).max() <= residual.LARGEST
     assert [row["samples"] for row in curve] == [32 * k for k in range(1, 9)]
-    assert curve[-1]["crossed"] == curve[-1]["half"] == 0.5 and curve[-1]["goal"] > 0.25 > curve[0]["goal"]
+    assert curve[-1]["crossed"] == curve[-1]["half"] == 1 / 3 and curve[-1]["goal"] > 1 / 6 > curve[0]["goal"]
+
+
+def test_half_of_the_valid_episodes_must_cross():
+    assert cross_half(np.array([[9, 10, 20, 20], [9, 9, 9, 18], [0, 0, 0, 0]])).tolist() == [
+        [False, True, True], [True, True, True], [False, False, False],
+    ]  # fmt: skip
 
 
 def test_open_are_confirmed_elites_that_no_controller_crosses():
