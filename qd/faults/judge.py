@@ -31,6 +31,7 @@ from qd.faults.steer import SteerCfg, measure_line, seek_witnesses
 from qd.search.archive import (
     ARCHIVE_FILE,
     NO_FURTHER_OUTCOMES,
+    NO_MUJOCO_C,
     OUTCOMES,
     Archive,
     FreshValues,
@@ -253,7 +254,9 @@ class Steered(Stage):
         found = [f"{(some.kind == kind).sum()} {words}" for kind, words in _WITNESS_WORDS.items()]
         print(f"Steered, robots cross {', '.join(found)}, of {len(rows)} terrains not certified before.", flush=True)
         before = archive.witnesses or no_witnesses(len(archive), limit_m)
-        return replace(archive, witnesses=before.updated(rows, some))
+        witnesses = before.updated(rows, some)
+        changed = not np.array_equal(witnesses.way, before.way)
+        return replace(archive, witnesses=witnesses, **(NO_MUJOCO_C if changed else {}))
 
 
 class OfFaults(Stage):
@@ -278,9 +281,12 @@ class OfFaults(Stage):
     def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
         """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
         hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
-        certificates = archive.certificates[archive.is_fault].T
-        stored = zip(archive.certifiers, archive.certifier_sha256, certificates, strict=True)
-        names = [name for name, digest, certifies in stored if certifies.any() and hashes.get(name) != digest]
+        certify = archive.certificates[archive.is_fault].any(axis=0)
+        if archive.witnesses is not None:
+            walkers = archive.witnesses.walker[archive.is_fault & ~archive.certified_by_controllers]
+            certify |= np.isin(np.array(archive.certifiers, np.str_), walkers)
+        stored = zip(archive.certifiers, archive.certifier_sha256, certify, strict=True)
+        names = [name for name, digest, certifies in stored if certifies and hashes.get(name) != digest]
         if lost := [name for name in names if not (renewed and name in hashes)]:
             rule = f"certifiers must be those that certify faults of {judging.search.run}"
             remedy = "give the files by --certifiers, or other controllers of these names and the stage others, too"

@@ -317,7 +317,8 @@ _BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _STEERED, _VARIED, _MUJOCO_C)  # grou
 _TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause", "witness_walker"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
 
-NO_FURTHER_OUTCOMES: dict[str, Any] = dict.fromkeys((*_VARIED, *_MUJOCO_C, "witnesses"))
+NO_MUJOCO_C: dict[str, Any] = dict.fromkeys(_MUJOCO_C)
+NO_FURTHER_OUTCOMES: dict[str, Any] = NO_MUJOCO_C | dict.fromkeys((*_VARIED, "witnesses"))
 """Columns of an archive whose faults nobody has crossed again."""
 
 

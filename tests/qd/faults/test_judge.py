@@ -280,7 +280,7 @@ def test_mujoco_c_crosses_faults_alone_and_no_soft_ground(path):
         InMujocoC().check(read_archive(path), soft, ())
 
 
-def witnessed(path, monkeypatch, kinds=(3,), **changes):
+def witnessed(path, monkeypatch, kinds=(3,), speed=0.0, **changes):
     """The archive after the stage steered, whose search finds such ways, and what it was asked: walkers and seeds."""
     asked = []
 
@@ -288,6 +288,7 @@ def witnessed(path, monkeypatch, kinds=(3,), **changes):
         asked.append((walkers, terrains.genes, seeds))
         found = no_witnesses(len(terrains), limit_m)
         found.walker[:], found.kind[:] = [*walkers][-1], np.resize(kinds, len(terrains))
+        found.way[..., 0] = speed
         return found
 
     monkeypatch.setattr("qd.faults.judge.seek_witnesses", seek)
@@ -333,6 +334,12 @@ def test_mujoco_c_steers_where_a_way_certifies(path, monkeypatch):
     assert by_ways.any() and held.holds_in_mujoco_c.tolist() == held.is_fault.tolist()
     assert held.steered_mujoco_c_outcomes.tolist() == np.where(by_ways[:, None], [6, 0, 0, 0], 0).tolist()
     assert np.array_equal(read_archive(path).steered_mujoco_c_outcomes, held.steered_mujoco_c_outcomes)
+    # The ways were of C-G, whose file must be there. Where other ways are found, nobody has crossed them yet.
+    write_archive(path / "archive.npz", replace(held, certifier_outcomes=0 * held.certifier_outcomes))
+    with pytest.raises(ValueError, match=r"certifiers .*C-G"):
+        judged(path, Robots(cross_by_genes, stop_after=0), stages=("mujoco_c",), certifiers={})
+    again, _ = witnessed(path, monkeypatch, (3, 0), speed=0.5)
+    assert again.mujoco_c_outcomes is None and "faults_mujoco_c" not in numbers_in(path)
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):

@@ -293,6 +293,12 @@ def test_faults_by_ways_stand_beside_those_by_controllers():
     assert sentences[0][1] == "Steered, at 0.5 m/s, this controller crosses it on the line, 17 of 20."
     assert sentences[1][0] == "It is not confirmed, and not known to be passable on the line."
     assert sentences[1][1] == "Steered, at 0.5 m/s, C-G crosses it by going round, 14 of 20."
+    episodes = {
+        "mujoco_c_outcomes": np.tile([0, 6, 0, 0], (5, 1)),
+        "steered_mujoco_c_outcomes": np.tile([6, 0, 0, 0], (5, 1)),
+    }
+    held = replace(archive, **episodes, certifier_mujoco_c_outcomes=0 * archive.certifier_outcomes)
+    assert describe_judgement(held, 1)[-2] == "In MuJoCo C it is one, too."
     archive = replace(archive, cause=np.array([""] * 5), family=np.arange(5))
     crosses = "2 are faults: another controller of this robot, or one that is steered, crosses them"
     assert summarise_search(ranked(archive), archive).endswith(crosses)
