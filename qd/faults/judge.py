@@ -281,10 +281,10 @@ class OfFaults(Stage):
     def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
         """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
         hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
-        certify = archive.certificates[archive.is_fault].any(axis=0)
+        certify = np.asarray(archive.certificates[archive.is_fault].any(axis=0), np.bool_)
         if archive.witnesses is not None:
             walkers = archive.witnesses.walker[archive.is_fault & ~archive.certified_by_controllers]
-            certify |= np.isin(np.array(archive.certifiers, np.str_), walkers)
+            certify[np.isin(np.array(archive.certifiers, np.str_), walkers)] = True
         stored = zip(archive.certifiers, archive.certifier_sha256, certify, strict=True)
         names = [name for name, digest, certifies in stored if certifies and hashes.get(name) != digest]
         if lost := [name for name in names if not (renewed and name in hashes)]:
