@@ -24,6 +24,7 @@ for robot in "${robots[@]}"; do
   for part in archive archive_cma_mae independent third; do
     make_file "$folder/$part/curve.json" archive "$robot"             # 60 min: four searches, two of them judged
   done
+  make_file "$folder/witness.json" witness "$robot"                   # 10 min
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/residual.json" residual "$robot"                 # 6 min
   make_file "$folder/agreement.json" agreement "$robot"               # 15 min, most of it MuJoCo C on 16 cores
