@@ -250,10 +250,11 @@ def pick_distinct(distances: NDArray[np.float64], least: float = 1.0) -> NDArray
 def judged_numbers(archive: Archive, space: TerrainSpace) -> dict[str, Any]:
     """The numbers of faults (:func:`fault_numbers`), and how many failing elites and faults are distinct."""
     numbers = fault_numbers(archive)
+    distances = kin_distances(archive.genes[archive.failing], space)
+    faults = archive.is_fault[archive.failing]
     known = {"failing": numbers["failing"] is not None, "faults": numbers["faults_panel"] is not None}
-    for name, chosen in (("failing", archive.failing), ("faults", archive.is_fault)):
-        count = int(find_distinct(archive.genes[chosen], space).sum())
-        numbers[f"{name}_distinct"] = count if known[name] else None
+    for name, some in (("failing", distances), ("faults", distances[faults][:, faults])):
+        numbers[f"{name}_distinct"] = int(pick_distinct(some).sum()) if known[name] else None
     return numbers
 
 

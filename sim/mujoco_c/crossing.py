@@ -25,7 +25,7 @@ from sim.mujoco_c.model import (
     NO_SOFTNESS,
     Starts,
     crossing_model,
-    distance_from_line,
+    distances_from_line,
     goal_commands,
     observations,
     steered_commands,
@@ -205,7 +205,7 @@ def cross_in_mujoco_c(
         judged[(judged == Outcome.RUNNING) & (step + 1 >= max_steps)] = Outcome.TIME_OUT
         outcome[running] = judged
         steps[running] += 1
-        deviation[running] = np.maximum(deviation[running], distance_from_line(episodes.qpos[running]))
+        deviation[running] = np.maximum(deviation[running], distances_from_line(episodes.qpos[running]))
         state = (episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running])
         penalties = step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
         sums[running] += robot.physics_dt * penalties

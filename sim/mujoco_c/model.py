@@ -247,7 +247,7 @@ def steered_commands(qpos: Array, steering: NDArray[np.floating]) -> Array:
     return np.clip(commands, CrossingCfg.lowest_command, CrossingCfg.highest_command)
 
 
-def distance_from_line(qpos: Array) -> Array:
+def distances_from_line(qpos: Array) -> Array:
     """Distance of bases from the straight line through start and goal [m], shape (num,)."""
     start, along = np.array(CrossingCfg.start), np.subtract(CrossingCfg.goal, CrossingCfg.start)
     beside = qpos[:, :2] - start
