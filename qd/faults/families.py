@@ -234,13 +234,8 @@ def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np
     return families.astype(np.int64)
 
 
-def find_distinct(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.bool_]:
-    """Which terrains are distinct, shape (N,): each that is no kin of a distinct one before it, (N, num_genes)."""
-    return pick_distinct(kin_distances(genes, space))
-
-
 def pick_distinct(distances: NDArray[np.float64], least: float = 1.0) -> NDArray[np.bool_]:
-    """Which terrains are at least so far from each one picked before, by distances of shape (N, N); shape (N,)."""
+    """Which terrains are distinct, at least so far from each one picked before, by distances (N, N); shape (N,)."""
     distinct = np.zeros(len(distances), bool)
     for row, to_others in enumerate(distances):
         distinct[row] = (to_others[distinct] >= least).all()

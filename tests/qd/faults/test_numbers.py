@@ -8,10 +8,10 @@ import pytest
 from qd.faults.families import (
     KIN_M,
     ORDERS,
-    find_distinct,
     find_families,
     judged_numbers,
     kin_distances,
+    pick_distinct,
     rank,
     summarise_search,
 )
@@ -381,9 +381,9 @@ def test_distinct_terrains_are_those_that_are_no_kin_of_a_distinct_one_before(he
     # Neighbours are 5 of 6 cm apart, others 10 and more; in a lower space both are a fifth.
     assert kin_distances(genes, space)[0] == pytest.approx([0.0, 5 / 6, 10 / 6, 15 / 6], rel=1e-5)
     assert find_families(genes, space).tolist() == [0, 0, 0, 0]
-    assert find_distinct(genes, space).tolist() == [True, False, True, False]
-    assert find_distinct(genes[[1, 0, 2, 3]], space).tolist() == [True, False, False, True]
-    assert find_distinct(genes[:0], space).tolist() == []
+    assert pick_distinct(kin_distances(genes, space)).tolist() == [True, False, True, False]
+    assert pick_distinct(kin_distances(genes[[1, 0, 2, 3]], space)).tolist() == [True, False, False, True]
+    assert pick_distinct(kin_distances(genes[:0], space)).tolist() == []
 
 
 def test_a_quarter_of_a_conditions_range_is_as_far_as_kin():
@@ -393,7 +393,8 @@ def test_a_quarter_of_a_conditions_range_is_as_far_as_kin():
     genes[3, 67] = -0.5  # motors at .7, of a range from .4 to 1.2
     expected = [0.0, 0.1 / 0.1125, 0.12 / 0.1125, 0.3 / 0.2]
     assert kin_distances(genes, space)[0] == pytest.approx(expected, rel=1e-5)
-    assert find_families(genes, space).tolist() == [0, 0, 0, 1] and find_distinct(genes, space).sum() == 3
+    assert find_families(genes, space).tolist() == [0, 0, 0, 1]
+    assert pick_distinct(kin_distances(genes, space)).sum() == 3
     genes[1] = np.append(SUPER_GAUSSIAN.hard_random(1, 0)[0], genes[1, 64:])
     heights = make_heights(genes[1:2, :64], every=2)
     assert kin_distances(genes, space)[0, 1] == pytest.approx(np.sqrt((heights**2).mean()) / KIN_M, rel=1e-5)
