@@ -6,7 +6,7 @@ that a judging that was stopped finds them when it is run again.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,10 +30,9 @@ from qd.faults.searches import Search, check_certifiers, find_certifiers, find_s
 from qd.faults.steer import SteerCfg, measure_line, seek_witnesses
 from qd.search.archive import (
     ARCHIVE_FILE,
-    NO_FURTHER_OUTCOMES,
-    NO_MUJOCO_C,
     OUTCOMES,
     Archive,
+    CrossedAgain,
     FreshValues,
     goal_rates,
     no_witnesses,
@@ -220,10 +219,10 @@ class Others(Stage):
                 table[rows, column] = values
                 columns[field] = table
             if hashes != stored:
-                columns |= NO_FURTHER_OUTCOMES
-            if hashes != stored and (witnesses := archive.witnesses) is not None:
-                by = np.flatnonzero(witnesses.walker == name)
-                columns["witnesses"] = witnesses.updated(by, no_witnesses(len(by), witnesses.limit_m))
+                columns |= {"varied": None, "mujoco_c": None}
+                if (witnesses := archive.witnesses) is not None:
+                    by = np.flatnonzero(witnesses.walker == name)
+                    columns["witnesses"] = witnesses.updated(by, no_witnesses(len(by), witnesses.limit_m))
             archive = replace(archive, certifiers=tuple(hashes), certifier_sha256=tuple(hashes.values()), **columns)
         return archive
 
@@ -255,8 +254,8 @@ class Steered(Stage):
         print(f"Steered, robots cross {', '.join(found)}, of {len(rows)} terrains not certified before.", flush=True)
         before = archive.witnesses or no_witnesses(len(archive), limit_m)
         witnesses = before.updated(rows, some)
-        changed = not np.array_equal(witnesses.way, before.way)
-        return replace(archive, witnesses=witnesses, **(NO_MUJOCO_C if changed else {}))
+        mujoco_c = archive.mujoco_c if np.array_equal(witnesses.way, before.way) else None
+        return replace(archive, witnesses=witnesses, mujoco_c=mujoco_c)
 
 
 class OfFaults(Stage):
@@ -292,6 +291,17 @@ class OfFaults(Stage):
             remedy = "give the files by --certifiers, or other controllers of these names and the stage others, too"
             raise ValueError(f"{rule}, got none or another file for {', '.join(lost)}: {remedy}")
 
+    @staticmethod
+    def _cross_by_certifiers(
+        archive: Archive, judging: Judging, asked: NDArray[np.bool_], cross: Callable[..., NDArray[np.int64]]
+    ) -> NDArray[np.int64]:
+        """Outcomes of each certifier on the elites that it is ``asked`` to cross, both of shape (N, C, ...)."""
+        outcomes = np.zeros_like(archive.certifier_outcomes)
+        for column, name in enumerate(archive.certifiers):
+            if len(rows := np.flatnonzero(asked[:, column])):
+                outcomes[rows, column] = cross(judging.certifiers[name], rows, name)
+        return outcomes
+
 
 class Varied(OfFaults):
     """Crosses faults under 20 draws of loads, motors, delays, noise and friction, by controller and certifiers."""
@@ -313,24 +323,20 @@ class Varied(OfFaults):
         search = judging.search
         rows = np.flatnonzero(archive.confirmed & archive.certified_by_controllers)
         space = varied_space(search.space)
-        seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)[rows]
-        drawn = [varied_genes(search.space, archive.genes[row], draws) for row, draws in zip(rows, seeds, strict=True)]
-        genes = np.array(drawn, np.float32).reshape(len(rows), EPISODES, space.num_genes)
+        seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)
 
-        def cross(policy: str, chosen: NDArray[np.bool_], label: str) -> NDArray[np.int64]:
-            chosen_genes = genes[chosen].reshape(-1, space.num_genes)
-            terrains = Terrains(genes=chosen_genes, seeds=seeds[chosen].ravel(), space=space)
+        def cross(policy: str, rows: NDArray[np.int64], label: str) -> NDArray[np.int64]:
+            genes = [varied_genes(search.space, archive.genes[row], seeds[row]) for row in rows]
+            drawn = np.array(genes, np.float32).reshape(-1, space.num_genes)
+            terrains = Terrains(genes=drawn, seeds=seeds[rows].ravel(), space=space)
             outcomes = judging.count(policy, terrains, f"{label}, varied conditions", replicas=1)
             return outcomes.reshape(-1, EPISODES, len(OUTCOMES)).sum(axis=1)
 
-        outcomes = np.zeros_like(archive.resolved_outcomes)
-        outcomes[rows] = cross(search.policy, np.ones(len(rows), bool), "searched")
-        others = np.zeros_like(archive.certifier_outcomes)
-        for column, name in enumerate(archive.certifiers):
-            certified = archive.certificates[rows, column]
-            if certified.any():
-                others[rows[certified], column] = cross(judging.certifiers[name], certified, name)
-        archive = replace(archive, varied_outcomes=outcomes, certifier_varied_outcomes=others)
+        searched = np.zeros_like(archive.resolved_outcomes)
+        searched[rows] = cross(search.policy, rows, "searched")
+        asked = archive.certificates & archive.confirmed[:, None]
+        certifiers = self._cross_by_certifiers(archive, judging, asked, cross)
+        archive = replace(archive, varied=CrossedAgain(searched=searched, certifiers=certifiers))
         num_robust = archive.robust.sum()
         print(f"{num_robust} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
         return archive
@@ -366,23 +372,20 @@ class InMujocoC(OfFaults):
                 undecided = ~is_decided(outcomes, sum(self.episodes))
                 chosen = rows[undecided]
                 steering = None if ways is None else np.repeat(ways[undecided][:, None], replicas, axis=1)
-                terrains = Terrains(
-                    genes=archive.genes[chosen], seeds=seeds[chosen, number], space=search.space, steering=steering
-                )
+                genes, drawn = archive.genes[chosen], seeds[chosen, number]
+                terrains = Terrains(genes=genes, seeds=drawn, space=search.space, steering=steering)
                 how |= {"replicas": replicas, "engine": "mujoco_c"}
                 outcomes[undecided] += judging.count(policy, terrains, f"{name} in MuJoCo C", **how)
             return outcomes
 
         rows = draw_faults(archive, search.cfg.seed, self.faults)
-        outcomes = np.zeros_like(archive.resolved_outcomes)
-        outcomes[rows] = cross(search.policy, rows, "searched")
-        others = np.zeros_like(archive.certifier_outcomes)
-        failing = rows[goal_rates(outcomes[rows]) < FAILING_GOAL_RATE]
-        best = np.array([best_certifier(archive, row) or "" for row in failing.tolist()], np.str_)
-        for column, name in enumerate(archive.certifiers):
-            if (best == name).any():
-                others[failing[best == name], column] = cross(judging.certifiers[name], failing[best == name], name)
-        steered = np.zeros_like(outcomes)
+        searched = np.zeros_like(archive.resolved_outcomes)
+        searched[rows] = cross(search.policy, rows, "searched")
+        failing = rows[goal_rates(searched[rows]) < FAILING_GOAL_RATE]
+        asked = np.zeros_like(archive.certificates)
+        asked[failing] = [[name == best_certifier(archive, row) for name in archive.certifiers] for row in failing]
+        certifiers = self._cross_by_certifiers(archive, judging, asked, cross)
+        steered = np.zeros_like(searched)
         if (witnesses := archive.witnesses) is not None:
             failing = failing[~archive.certified_by_controllers[failing]]
             walkers = {SEARCHED: search.policy, **judging.certifiers}
@@ -390,8 +393,7 @@ class InMujocoC(OfFaults):
                 rows_of = failing[witnesses.walker[failing] == name]
                 ways, limit_m = witnesses.way[rows_of], witnesses.limit_m
                 steered[rows_of] = cross(walkers[name], rows_of, f"{name} steered", ways, limit_m=limit_m)
-        columns = {"certifier_mujoco_c_outcomes": others, "steered_mujoco_c_outcomes": steered}
-        archive = replace(archive, mujoco_c_outcomes=outcomes, **columns)
+        archive = replace(archive, mujoco_c=CrossedAgain(searched=searched, certifiers=certifiers, steered=steered))
         print(f"{archive.holds_in_mujoco_c.sum()} of {len(rows)} faults hold in MuJoCo C.", flush=True)
         return archive
 

@@ -31,7 +31,7 @@ from qd.faults.numbers import (
     read_minimal,
 )
 from qd.faults.searches import Search, find_search
-from qd.search.archive import NO_FURTHER_OUTCOMES, OUTCOMES, Archive, goal_rates, no_outcomes
+from qd.search.archive import OUTCOMES, Archive, goal_rates, no_outcomes
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.show.figures import draw_minimal, save_figure
 from qd.workers.compute import Compute
@@ -337,7 +337,7 @@ def _as_elites(archive: Archive, cases: Mapping[int, Case], space: TerrainSpace)
     episodes = {"episodes": counts.sum(axis=1), "invalid_episodes": counts[:, OUTCOMES.index("invalid")]}
     fresh = replace(rows.fresh, goal_rate=goal_rates(counts), **episodes)
     unjudged: dict[str, Any] = no_outcomes(len(rows)) | dict.fromkeys(("certifiers", "certifier_sha256"), ())
-    unjudged |= NO_FURTHER_OUTCOMES
+    unjudged |= dict.fromkeys(("witnesses", "varied", "mujoco_c"))
     return replace(rows, genes=np.array(genes, np.float32).reshape(rows.genes.shape), fresh=fresh, **unjudged)
 
 

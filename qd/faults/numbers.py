@@ -129,11 +129,11 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
         numbers["faults_fdr"] = int((is_fault & find_significant(archive)).sum())
         if families is not None:
             numbers["fault_families"] = len(np.unique(families[is_fault]))
-        if archive.varied_outcomes is not None:
-            numbers["crossed_varied"] = int((is_fault & archive.varied_outcomes.any(axis=1)).sum())
+        if archive.varied is not None:
+            numbers["crossed_varied"] = int((is_fault & archive.varied.searched.any(axis=1)).sum())
             numbers["robust"] = int(archive.robust.sum())
-        if archive.mujoco_c_outcomes is not None:
-            tried = is_fault & archive.mujoco_c_outcomes.any(axis=1)
+        if archive.mujoco_c is not None:
+            tried = is_fault & archive.mujoco_c.searched.any(axis=1)
             numbers["faults_mujoco_c"] = _share_held(archive, tried)
             numbers["faults_mujoco_c"]["strong"] = _share_held(archive, tried & archive.strong)
     return numbers
@@ -193,15 +193,16 @@ def best_certifier(archive: Archive, number: int, among: Container[str] | None =
 
 def _certifier_outcomes(archive: Archive) -> dict[str, NDArray[np.int64]]:
     """Outcomes of the certifiers by kind of episodes, shape (N, C, 4)."""
-    tables = (archive.certifier_outcomes, archive.certifier_resolved_outcomes, archive.certifier_varied_outcomes)
+    varied = archive.varied and archive.varied.certifiers
+    tables = (archive.certifier_outcomes, archive.certifier_resolved_outcomes, varied)
     return {kind: table for kind, table in zip(_KINDS, tables, strict=True) if table is not None}
 
 
 def further_rates(archive: Archive, number: int) -> dict[str, tuple[int, int]]:
     """Further episodes on an elite that reached the goal, and valid ones, by controller and conditions."""
     counts = {"With contact resolved (steps of 1 ms)": archive.resolved_outcomes[number]}
-    if archive.varied_outcomes is not None:
-        counts["Under varied conditions"] = archive.varied_outcomes[number]
+    if archive.varied is not None:
+        counts["Under varied conditions"] = archive.varied.searched[number]
     for column, name in enumerate(archive.certifiers):
         for kind, table in _certifier_outcomes(archive).items():
             counts[name + _KINDS[kind]] = table[number, column]
@@ -217,7 +218,7 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
     known: dict[str, Any] = {"rates": rates, "witness": witness}
     known["crossers"] = [*compress(archive.certifiers, archive.certificates[number].tolist())]
     known |= {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
-    known["in_mujoco_c"] = archive.mujoco_c_outcomes is not None and archive.mujoco_c_outcomes[number].any()
+    known["in_mujoco_c"] = archive.mujoco_c is not None and archive.mujoco_c.searched[number].any()
     known["on_line"] = archive.witnesses is not None and archive.witnesses.on_line[number]
     return TEMPLATES.get_template("elite.txt").render(known).splitlines()
 
@@ -270,8 +271,8 @@ def judgement(archive: Archive, number: int) -> dict[str, Any]:
     hash of each controller that certifies it, and its rates at the ``searched`` settings and under the same conditions.
     """
     resolved = archive.resolved_outcomes[number]
-    varied = archive.varied_outcomes
-    under_varied = {} if varied is None or not varied[number].any() else {"varied": rate_numbers(varied[number])}
+    varied = None if archive.varied is None else archive.varied.searched[number]
+    under_varied = {} if varied is None or not varied.any() else {"varied": rate_numbers(varied)}
     return under_varied | {
         "resolved": rate_numbers(resolved) if resolved.any() else None,
         "certificates": [

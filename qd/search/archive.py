@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import SEGMENTS, STEERING
 from qd.search.descriptors import Cells
-from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation
+from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, Table
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
 from sim.files.settings import PositiveInt
@@ -42,7 +42,7 @@ WITNESSES = ("", "around", "beside", "line")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Witnesses:
+class Witnesses(Table):
     """Ways by which a controller crosses some of N elites, if it does (:mod:`qd.faults.steer`)."""
 
     walker: NDArray[np.str_]
@@ -63,20 +63,12 @@ class Witnesses:
         """Whether a witness on the line certifies that an elite can be crossed, shape (N,)."""
         return self.kind == WITNESSES.index("line")
 
-    def rows(self, chosen: NDArray[Any]) -> "Witnesses":
-        """The ways on some of the elites alone, in the order given."""
-        return replace(self, **{name: column[chosen] for name, column in self._columns.items()})
-
     def updated(self, rows: NDArray[np.int64], others: "Witnesses") -> "Witnesses":
         """The ways with those on some of the elites replaced by as many others."""
-        columns = {name: column.copy() for name, column in self._columns.items()}
-        for name, column in columns.items():
-            column[rows] = others._columns[name]
-        return replace(self, **columns)
-
-    @property
-    def _columns(self) -> dict[str, Any]:
-        return {name: vars(self)[name] for name in ("walker", "kind", "way", "counts")}
+        updated = self.rows(np.arange(len(self.kind)))
+        for name in ("walker", "kind", "way", "counts"):
+            getattr(updated, name)[rows] = getattr(others, name)
+        return updated
 
 
 def no_witnesses(count: int, limit_m: float) -> Witnesses:
@@ -103,6 +95,16 @@ def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
     invalid = counts[..., OUTCOMES.index("invalid")]
     is_known = (episodes > 0) & (invalid <= MAX_INVALID_SHARE * episodes)
     return np.where(is_known, counts[..., 0] / np.maximum(episodes - invalid, 1), np.nan)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CrossedAgain(Table):
+    """Outcomes of N elites, as of an :class:`Archive`, some of which were crossed under other conditions."""
+
+    searched: NDArray[np.int64]
+    certifiers: NDArray[np.int64]
+    steered: NDArray[np.int64] | None = None
+    """Of witnesses on the line, shape (N, 4); what leaves it does not count as the goal."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,15 +169,10 @@ class Archive(Evaluation, Subject):
     witnesses: Witnesses | None = None
     """None before the stage ``steered``."""
 
-    # Under varied conditions (:func:`sim.terrains.spaces.wider.varied_genes`); None before.
-    varied_outcomes: NDArray[np.int64] | None = None
-    certifier_varied_outcomes: NDArray[np.int64] | None = None
-
-    # In MuJoCo C with contact resolved, of some faults and a certifier each, until decided; None before.
-    mujoco_c_outcomes: NDArray[np.int64] | None = None
-    certifier_mujoco_c_outcomes: NDArray[np.int64] | None = None
-    steered_mujoco_c_outcomes: NDArray[np.int64] | None = None
-    """Of witnesses on the line; what leaves it does not count as the goal."""
+    varied: CrossedAgain | None = None
+    """Faults under varied conditions (:func:`sim.terrains.spaces.wider.varied_genes`); None before."""
+    mujoco_c: CrossedAgain | None = None
+    """Some faults and what certifies each in MuJoCo C with contact resolved, until decided; None before."""
 
     def __len__(self) -> int:
         return len(self.fitness)
@@ -248,43 +245,26 @@ class Archive(Evaluation, Subject):
     @property
     def robust(self) -> NDArray[np.bool_]:
         """Whether a fault is one under varied conditions too, shape (N,)."""
-        return self._is_fault_by(self.varied_outcomes, self.certifier_varied_outcomes)
+        return self._is_fault_by(self.varied)
 
     @property
     def holds_in_mujoco_c(self) -> NDArray[np.bool_]:
         """Whether a fault is one in MuJoCo C too, shape (N,)."""
-        steered = self.steered_mujoco_c_outcomes
-        return self._is_fault_by(self.mujoco_c_outcomes, self.certifier_mujoco_c_outcomes, steered)
+        return self._is_fault_by(self.mujoco_c)
 
-    def _is_fault_by(
-        self,
-        outcomes: NDArray[np.int64] | None,
-        certifier_outcomes: NDArray[np.int64] | None,
-        steered: NDArray[np.int64] | None = None,
-    ) -> NDArray[np.bool_]:
+    def _is_fault_by(self, again: CrossedAgain | None) -> NDArray[np.bool_]:
         """Faults of which the controller crosses under half by other outcomes, and what certifies it at least half."""
-        if outcomes is None or certifier_outcomes is None:
+        if again is None:
             return np.zeros(len(self), bool)
-        crosses = self.certificates & (goal_rates(certifier_outcomes) >= FAILING_GOAL_RATE)
-        can_be_crossed = crosses.any(axis=1)
-        if steered is not None:
-            can_be_crossed |= goal_rates(steered) >= FAILING_GOAL_RATE
-        return self.is_fault & (goal_rates(outcomes) < FAILING_GOAL_RATE) & can_be_crossed
+        crosses = self.certificates & (goal_rates(again.certifiers) >= FAILING_GOAL_RATE)
+        by_witness = False if again.steered is None else goal_rates(again.steered) >= FAILING_GOAL_RATE
+        fails = goal_rates(again.searched) < FAILING_GOAL_RATE
+        return self.is_fault & fails & (crosses.any(axis=1) | by_witness)
 
     @property
     def is_judged(self) -> bool:
         """Whether anything was crossed with contact resolved, by other controllers, or steered."""
         return bool(self.certifiers) or bool(self.resolved_outcomes.any()) or self.witnesses is not None
-
-    def rows(self, chosen: NDArray[Any]) -> "Archive":
-        """The archive with some of its elites alone, in the order given."""
-        groups = {name: values and values.rows(chosen) for name, values in self._groups.items()}
-        return replace(super().rows(chosen), **groups)
-
-    @property
-    def _groups(self) -> dict[str, Any]:
-        """Groups of columns that are values of their own, by the field's name."""
-        return {"fresh": self.fresh, "witnesses": self.witnesses}
 
     def corrected_by(self, fresh: FreshValues) -> "Archive":
         """The archive with fresh values, by descending corrected fitness, the invalid elites last."""
@@ -303,33 +283,31 @@ _SETTINGS = {field.name: "" for field in fields(Subject)} | {"iterations": "", "
 _VALUES = {field.name: "N" for field in fields(Evaluation)} | {"end_position": "N2"}
 _VALUES |= dict.fromkeys(("ratios", "penalty_mean", "penalty_std"), "NP")
 _FOUND = {**_VALUES, "genes": "NG", "iteration": "N"}
-_PREFIX = "fresh_"
-_FRESH = {_PREFIX + name: shape for name, shape in {**_VALUES, "reproduced": "N"}.items()}
 _GROUPED = {"family": "N", "cause": "N"}
 _CERTIFIERS = {"certifiers": "C", "certifier_sha256": "C"}
 _CROSSED = {**_CERTIFIERS, "resolved_outcomes": "N4", "certifier_outcomes": "NC4", "certifier_resolved_outcomes": "NC4"}
-_WITNESS = "witness_"
-_STEERED = {f"{_WITNESS}{name}": shape for name, shape in {"walker": "N", "kind": "N", "way": "NS3"}.items()}
-_STEERED |= {f"{_WITNESS}counts": "N224", f"{_WITNESS}limit_m": ""}
-_VARIED = {"varied_outcomes": "N4", "certifier_varied_outcomes": "NC4"}
-_MUJOCO_C = {"mujoco_c_outcomes": "N4", "certifier_mujoco_c_outcomes": "NC4", "steered_mujoco_c_outcomes": "N4"}
-_BY_JUDGING = (_FRESH, _GROUPED, _CROSSED, _STEERED, _VARIED, _MUJOCO_C)  # groups that a file has whole, or not at all
+_WITNESS = {"walker": "N", "kind": "N", "way": "NS3", "counts": "N224", "limit_m": ""}
+_VARIED = {"searched": ("varied_outcomes", "N4"), "certifiers": ("certifier_varied_outcomes", "NC4")}
+_MUJOCO_C = {name: (key.replace("varied", "mujoco_c"), shape) for name, (key, shape) in _VARIED.items()}
+_TABLES: dict[str, tuple[type[Table], dict[str, tuple[str, str]]]] = {
+    "varied": (CrossedAgain, _VARIED),
+    "mujoco_c": (CrossedAgain, _MUJOCO_C | {"steered": ("steered_mujoco_c_outcomes", "N4")}),
+    "fresh": (FreshValues, {name: (f"fresh_{name}", shape) for name, shape in {**_VALUES, "reproduced": "N"}.items()}),
+    "witnesses": (Witnesses, {name: (f"witness_{name}", shape) for name, shape in _WITNESS.items()}),
+}  # by field of the archive: what it is, and the name and dimensions of each column in the file
+_BY_JUDGING = (_GROUPED, _CROSSED, *(dict(columns.values()) for _, columns in _TABLES.values()))  # whole, or not at all
 _TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause", "witness_walker"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
-
-NO_MUJOCO_C: dict[str, Any] = dict.fromkeys(_MUJOCO_C)
-NO_FURTHER_OUTCOMES: dict[str, Any] = NO_MUJOCO_C | dict.fromkeys((*_VARIED, "witnesses"))
-"""Columns of an archive whose faults nobody has crossed again."""
+_FINITE = ("genes", "fitness", "scales", "witness_way", "witness_limit_m")
 
 
 def write_archive(path: Path, archive: Archive) -> None:
     """Writes an archive as a compressed npz, atomically; equal archives give equal bytes."""
-    groups = [_SETTINGS, _FOUND, _GROUPED, *([_CROSSED, _VARIED, _MUJOCO_C] if archive.is_judged else [])]
+    groups = (_SETTINGS, _FOUND, _GROUPED, _CROSSED if archive.is_judged else {})
     values = {name: getattr(archive, name) for group in groups for name in group}
-    if archive.fresh is not None:
-        values |= {_PREFIX + name: column for name, column in vars(archive.fresh).items()}
-    if archive.witnesses is not None:
-        values |= {_WITNESS + name: column for name, column in vars(archive.witnesses).items()}
+    for field, (_, columns) in _TABLES.items():
+        if (table := getattr(archive, field)) is not None:
+            values |= {key: getattr(table, name) for name, (key, _) in columns.items()}
     values |= {name: np.array(values[name], np.str_) for name in _CERTIFIERS if name in values}  # of none, too
     arrays = {name: np.asarray(value) for name, value in values.items() if value is not None}
     if archive.is_judged:
@@ -354,20 +332,17 @@ def read_archive(path: str | Path) -> Archive:
             kinds, content = ("U", "texts") if name in _TEXTS else ("bif", "numbers")
             if array.dtype.kind not in kinds:
                 raise ValueError(f"{name} must hold {content}, got {array.dtype}")
-            if (
-                name in ("genes", "fitness", "scales", "witness_way", "witness_limit_m")
-                and not np.isfinite(array).all()
-            ):
+            if name in _FINITE and not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite")
         values: dict[str, Any] = no_outcomes(len(arrays["fitness"])) | arrays
-        for name in arrays.keys() & {*_SETTINGS, *_CERTIFIERS}:  # as the dataclass has them
-            values[name] = tuple(array.tolist()) if (array := arrays[name]).ndim else array.item()
-        fresh = {name.removeprefix(_PREFIX): values.pop(name) for name in _FRESH if name in values}
-        steered = {name.removeprefix(_WITNESS): values.pop(name) for name in _STEERED if name in values}
-        if steered and not np.isin(steered["kind"], np.arange(len(WITNESSES))).all():
+        if not np.isin(values.get("witness_kind", 0), np.arange(len(WITNESSES))).all():
             raise ValueError(f"witness_kind must be from 0 to {len(WITNESSES) - 1}")
-        witnesses = Witnesses(**{**steered, "limit_m": float(steered["limit_m"])}) if steered else None
-        return Archive(**values, fresh=FreshValues(**fresh) if fresh else None, witnesses=witnesses)
+        for name in arrays.keys() & {*_SETTINGS, *_CERTIFIERS, "witness_limit_m"}:  # as the dataclasses have them
+            values[name] = tuple(array.tolist()) if (array := arrays[name]).ndim else array.item()
+        for field, (kind, columns) in _TABLES.items():
+            table = {name: values.pop(key) for name, (key, _) in columns.items() if key in values}
+            values[field] = kind(**table) if table else None
+        return Archive(**values)
     except Exception as error:  # zip, zlib and npy headers answer damage with a dozen types
         message = f"{file} must be the archive of a search, but it is damaged or another file: {error}"
         raise ValueError(message) from None

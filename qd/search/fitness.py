@@ -51,7 +51,18 @@ class FitnessCfg:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class Table:
+    """Columns of equally many rows; a value of a table may be a table of further columns."""
+
+    def rows(self, chosen: NDArray[Any]) -> Self:
+        """Some of the rows alone, in the order given; arrays are copied."""
+        columns: dict[str, Any] = {name: v[chosen] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        tables = {name: table.rows(chosen) for name, table in vars(self).items() if isinstance(table, Table)}
+        return replace(self, **columns, **tables)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation(Table):
     """Evaluations of T terrains; statistics are over valid episodes, penalties are scaled.
 
     Shapes are (T, P) for what each of P penalties has, ratios, means and standard deviations, and else (T,).
@@ -100,11 +111,6 @@ class Evaluation:
     def valid(self) -> NDArray[np.bool_]:
         """Whether a terrain's numbers mean anything, shape (T,)."""
         return self.invalid_episodes <= MAX_INVALID_SHARE * self.episodes
-
-    def rows(self, chosen: NDArray[Any]) -> Self:
-        """Some of the terrains alone, in the order given; arrays are copied."""
-        columns = {name: values[chosen] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
-        return replace(self, **columns)
 
 
 def join_evaluations(evaluations: Sequence[Evaluation]) -> Evaluation:

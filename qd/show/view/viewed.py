@@ -131,8 +131,8 @@ class ViewedRun(OpenedRun):
         hits = {name: ranking.hits(name, number) for name in _RATES}
         columns: list[Column] = [(first, int(ranking.counted[number]), hits)]
         further = {"finer contact": archive.resolved_outcomes[number]}
-        if archive.varied_outcomes is not None:
-            further["varied"] = archive.varied_outcomes[number]
+        if archive.varied is not None:
+            further["varied"] = archive.varied.searched[number]
         if name := best_certifier(archive, number):
             further[name] = archive.certifier_outcomes[number, archive.certifiers.index(name)]
         for head, ends in further.items():

@@ -182,14 +182,13 @@ def test_a_fault_is_robust_if_it_is_one_under_the_same_20_varied_conditions_too(
     before, crossed = judged(path), []
     rows = np.flatnonzero(before.is_fault)
     archive = vary(path, before, crossed)
-    assert archive.varied_outcomes[rows].sum(axis=1).tolist() == [20] * len(rows)
-    assert 0 < archive.varied_outcomes[rows[0], 1] < 10  # collisions where motors are weak
+    assert archive.varied.searched[rows].sum(axis=1).tolist() == [20] * len(rows)
+    assert 0 < archive.varied.searched[rows[0], 1] < 10  # collisions where motors are weak
     assert archive.robust.tolist() == (before.is_fault & (np.arange(len(before)) != rows[0])).tolist()
     assert numbers_in(path)["robust"] == numbers_in(path)["crossed_varied"] - 1 == len(rows) - 1 > 0
     assert np.array_equal(read_archive(path).robust, archive.robust)
-    half = archive.varied_outcomes.copy()
-    half[rows[-1]] = [10, 10, 0, 0]  # it crosses half of them: so it does not fail
-    assert not replace(archive, varied_outcomes=half).robust[rows[-1]]
+    archive.varied.searched[rows[-1]] = [10, 10, 0, 0]  # it crosses half of them: so it does not fail
+    assert not archive.robust[rows[-1]]
     assert {cfg.space for cfg, *_ in crossed} == {VARIED_SPACE.name}
     by_policy = [
         [row for cfg, genes, _ in crossed if cfg.policy == name for row in genes] for name in (SHIPPED, *OTHER.values())
@@ -258,8 +257,8 @@ def test_a_fault_holds_in_mujoco_c_if_the_controller_fails_and_its_best_certifie
         judged(path, stopped, stages=("mujoco_c",))
     rest = Robots(rule)
     archive = judged(path, rest, stages=("mujoco_c",))
-    assert archive.mujoco_c_outcomes[rows].tolist() == [[6, 0, 0, 0], [4, 6, 0, 0], [0, 6, 0, 0]]
-    assert archive.certifier_mujoco_c_outcomes[rows, 0].tolist() == [[0, 0, 0, 0], [6, 0, 0, 0], [0, 6, 0, 0]]
+    assert archive.mujoco_c.searched[rows].tolist() == [[6, 0, 0, 0], [4, 6, 0, 0], [0, 6, 0, 0]]
+    assert archive.mujoco_c.certifiers[rows, 0].tolist() == [[0, 0, 0, 0], [6, 0, 0, 0], [0, 6, 0, 0]]
     # The controller on three faults, stopped; again on one, and its certifier where it fails.
     assert [len(robots.crossed) for robots in (stopped, rest)] == [3, 1 + 2]
     assert np.flatnonzero(archive.holds_in_mujoco_c).tolist() == [narrow]
@@ -267,7 +266,7 @@ def test_a_fault_holds_in_mujoco_c_if_the_controller_fails_and_its_best_certifie
     assert (numbers["tried"], numbers["hold"]) == (3, 1)
     assert np.array_equal(read_archive(path).holds_in_mujoco_c, archive.holds_in_mujoco_c)
     # Another controller of the certifier's name is another certifier.
-    assert judged(path, stages=("others",), certifiers={"C-G": WEAK}).mujoco_c_outcomes is None
+    assert judged(path, stages=("others",), certifiers={"C-G": WEAK}).mujoco_c is None
     assert "faults_mujoco_c" not in numbers_in(path)
 
 
@@ -332,14 +331,14 @@ def test_mujoco_c_steers_where_a_way_certifies(path, monkeypatch):
     robots = Robots(lambda cfg, genes, seeds: np.full(len(genes), not (cfg.with_steering or "C-G" in cfg.policy)))
     held = judged(path, robots, stages=("mujoco_c",))
     assert by_ways.any() and held.holds_in_mujoco_c.tolist() == held.is_fault.tolist()
-    assert held.steered_mujoco_c_outcomes.tolist() == np.where(by_ways[:, None], [6, 0, 0, 0], 0).tolist()
-    assert np.array_equal(read_archive(path).steered_mujoco_c_outcomes, held.steered_mujoco_c_outcomes)
+    assert held.mujoco_c.steered.tolist() == np.where(by_ways[:, None], [6, 0, 0, 0], 0).tolist()
+    assert np.array_equal(read_archive(path).mujoco_c.steered, held.mujoco_c.steered)
     # The ways were of C-G, whose file must be there. Where other ways are found, nobody has crossed them yet.
     write_archive(path / "archive.npz", replace(held, certifier_outcomes=0 * held.certifier_outcomes))
     with pytest.raises(ValueError, match=r"certifiers .*C-G"):
         judged(path, Robots(cross_by_genes, stop_after=0), stages=("mujoco_c",), certifiers={})
     again, _ = witnessed(path, monkeypatch, (3, 0), speed=0.5)
-    assert again.mujoco_c_outcomes is None and "faults_mujoco_c" not in numbers_in(path)
+    assert again.mujoco_c is None and "faults_mujoco_c" not in numbers_in(path)
 
 
 def test_certificates_of_several_controllers_add_up_and_a_new_one_of_the_name_replaces_them(path, tmp_path):

@@ -28,7 +28,7 @@ from qd.faults.numbers import (
     judgement,
     rate_numbers,
 )
-from qd.search.archive import no_outcomes, no_witnesses
+from qd.search.archive import CrossedAgain, no_outcomes, no_witnesses
 from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
 from sim.terrains.spaces.registry import get_space
@@ -112,7 +112,7 @@ def test_faults_that_hold_in_mujoco_c_are_a_share_of_those_tried():
     others = np.zeros((5, 2, 4), np.int64)
     others[[0, 1, 2], 1], others[3, 0] = [crosses, crosses, [5, 1, 2, 0]], crosses  # C-G has no certificate
     outcomes = np.array([fails, fails, [2, 5, 1, 0], [0, 6, 0, 0], never])
-    archive = replace(archive, mujoco_c_outcomes=outcomes, certifier_mujoco_c_outcomes=others)
+    archive = replace(archive, mujoco_c=CrossedAgain(searched=outcomes, certifiers=others))
     (numbers,) = pick_numbers(replace(archive, family=np.array([4, 2, 3, 0, 1])), "faults_mujoco_c")
     # Wilson, 3 of 4: (.75 + 3.842 / 8) / (1 + 3.842 / 4) = .6275, 1.96 sqrt(.75 .25 / 4 + 3.842 / 64) / 1.9604 = .3269
     assert (numbers["tried"], numbers["hold"]) == (4, 3)
@@ -293,11 +293,9 @@ def test_faults_by_ways_stand_beside_those_by_controllers():
     assert sentences[0][1] == "Steered, at 0.5 m/s, this controller crosses it on the line, 17 of 20."
     assert sentences[1][0] == "It is not confirmed, and not known to be passable on the line."
     assert sentences[1][1] == "Steered, at 0.5 m/s, C-G crosses it by going round, 14 of 20."
-    episodes = {
-        "mujoco_c_outcomes": np.tile([0, 6, 0, 0], (5, 1)),
-        "steered_mujoco_c_outcomes": np.tile([6, 0, 0, 0], (5, 1)),
-    }
-    held = replace(archive, **episodes, certifier_mujoco_c_outcomes=0 * archive.certifier_outcomes)
+    fails, arrives = np.array([[[0, 6, 0, 0]], [[6, 0, 0, 0]]]).repeat(5, axis=1)
+    again = CrossedAgain(searched=fails, steered=arrives, certifiers=0 * archive.certifier_outcomes)
+    held = replace(archive, mujoco_c=again)
     assert describe_judgement(held, 1)[-2] == "In MuJoCo C it is one, too."
     archive = replace(archive, cause=np.array([""] * 5), family=np.arange(5))
     crosses = "2 are faults: another controller of this robot, or one that is steered, crosses them"
