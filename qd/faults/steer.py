@@ -40,11 +40,11 @@ class SteerCfg:
     """Samples that the next generation is drawn near."""
     step: float = 0.7
     """How far the distribution moves toward that of the best samples, as a share."""
-    speed_std: float = 0.2
+    speed_std: float = 0.3
     """Of the first generation [m/s]."""
-    offset_std: float = 0.25
+    offset_std: float = 0.4
     """[m]; four times as much where no limit holds."""
-    heading_std: float = 0.3
+    heading_std: float = 0.5
     """[rad]"""
     least_std: float = 0.05
     """Of any generation, of all three."""

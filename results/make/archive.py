@@ -3,15 +3,15 @@
 The default method and the paper's method, and the default one again with another seed, to a million episodes. Each is
 a search of preset wide. On the way its elites cross fresh episodes, and curve.json has what they say. A third seed is
 searched for that alone.
-The first two are judged: contact resolved, a specialist trained on what fails, others' crossings, varied conditions,
-MuJoCo C.
+The first two are judged: contact resolved, a specialist trained on what fails, others' crossings, varied conditions;
+witness.py goes on.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qd.faults.judge import STAGES, judge
+from qd.faults.judge import judge
 from qd.search.directory import RunDirectory
 from results.make.common import ARCHIVE_FILES, CURVE_FILE, FRESH_COUNTS, PAPER_SIZE, Script, follow_search, parse
 from sim.files.atomic import to_json, write_atomically
@@ -25,6 +25,7 @@ SEARCHES: dict[str, tuple[dict[str, Any], int]] = {
     "third": ({}, 2),
 }
 """Changes of preset wide, and seed of each."""
+STAGES = ("fresh", "resolved", "others", "varied")
 CURVE = (192_000, 384_000, 992_000, 1_984_000, 4_000_000)
 """Episodes after which elites cross fresh ones; searches with other seeds end at the third."""
 PUBLISHED = (*ARCHIVE_FILES, "*.png", "minimal.*", "certifiers/specialist.*", CURVE_FILE)
@@ -47,16 +48,16 @@ def make_archive(script: Script, name: str) -> Path:
 def judge_with_specialist(script: Script, run: Path) -> dict[str, Any]:
     """Judges a search with its own specialist among the certifiers; returns the content of archive.json.
 
-    What today's sources have judged in all stages is read.
+    What today's sources have judged in these stages is read.
     """
     numbers = RunDirectory(run).read_summary()
     judged_by = [numbers.get("judged_by", {}).get(stage, {}) for stage in STAGES]
     if all(origin.get("sources_sha256") == script.origin["sources_sha256"] for origin in judged_by):
         return numbers
-    archive = judge(run, stages=("fresh", "resolved"), compute=script.compute)
+    archive = judge(run, stages=STAGES[:2], compute=script.compute)
     if archive.failing.any():
         train_specialist(script.robot, run, FinetuneCfg.specialist(script.robot), RunCfg(device=script.device))
-    judge(run, stages=("others", "varied", "mujoco_c"), compute=script.compute)
+    judge(run, stages=STAGES[2:], compute=script.compute)
     return RunDirectory(run).read_summary()
 
 
