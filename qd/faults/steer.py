@@ -84,39 +84,21 @@ def seek_witnesses(
     for index, (name, policy) in enumerate(walkers.items()):
         rows = np.flatnonzero(~best.on_line)
         drawn = seeds[rows, index * cfg.seeds : (index + 1) * cfg.seeds]
-        some, words = terrains[rows], f"{label}{name}"
-        ways = find_ways(
-            crosser,
-            policy,
-            some,
-            drawn[:, :generations],
-            limit_m=limit_m,
-            rng=rng,
-            label=f"{words} on the line",
-            cfg=cfg,
-        )
+        some, words, how = terrains[rows], f"{label}{name}", dict[str, Any](rng=rng, cfg=cfg)
+        on_line = f"{words} on the line"
+        ways = find_ways(crosser, policy, some, drawn[:, :generations], limit_m=limit_m, label=on_line, **how)
         plain = np.full_like(ways, np.nan)
         counts = np.zeros((len(rows), 2, 2, 4), np.int64)
         for column, tried in enumerate((plain, ways)):
             counts[:, 0, column] = try_ways(crosser, policy, some, tried, drawn[:, -2], limit_m, label=words)
         off = np.flatnonzero(counts[:, 0, 1, 0] < FAILING_GOAL_RATE * counts[:, 0, 1, 3])
-        ways[off] = find_ways(
-            crosser,
-            policy,
-            some[off],
-            drawn[off, generations:-2],
-            limit_m=None,
-            rng=rng,
-            label=f"{words} around",
-            cfg=cfg,
-        )
+        others = drawn[off, generations:-2]
+        ways[off] = find_ways(crosser, policy, some[off], others, limit_m=None, label=f"{words} around", **how)
         counts[off, 0, 1] = try_ways(crosser, policy, some[off], ways[off], drawn[off, -2], limit_m, label=words)
         cross = np.flatnonzero(counts[:, 0, 1, 2] >= FAILING_GOAL_RATE * np.maximum(counts[:, 0, 1, 3], 1))
         for column, tried in enumerate((plain, ways)):
-            how: Any = {"label": f"{words}, contact resolved", "engine": "resolved"}
-            counts[cross, 1, column] = try_ways(
-                crosser, policy, some[cross], tried[cross], drawn[cross, -1], limit_m, **how
-            )
+            again, fine = (some[cross], tried[cross], drawn[cross, -1]), f"{words}, contact resolved"
+            counts[cross, 1, column] = try_ways(crosser, policy, *again, limit_m, fine, "resolved")
         kind = find_kinds(counts)
         tried = Witnesses(walker=np.full(len(rows), name), kind=kind, way=ways, counts=counts, limit_m=limit_m)
         better = np.flatnonzero((kind > best.kind[rows]) | (best.walker[rows] == ""))

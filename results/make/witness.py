@@ -26,6 +26,7 @@ from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
 
 ARCHIVES = ("archive", "archive_cma_mae")
+_KINDS = [(kind, word) for kind, word in enumerate(WITNESSES) if word]
 GENERATIONS = (1, 2, 4, 8, 12, 16, 24)
 CURVE_TERRAINS = 200
 _COUNTS = (
@@ -46,19 +47,14 @@ def judge_steered(script: Script, name: str) -> tuple[Archive, dict[str, Any]]:
         archive = judge(run, stages=("mujoco_c",), compute=script.compute)
     witnesses = archive.witnesses
     assert witnesses is not None
-    by_walker = {
-        str(walker): {
-            word: int(((witnesses.walker == walker) & (witnesses.kind == kind)).sum()) for kind, word in _KINDS
-        }
-        for walker in np.unique(witnesses.walker[witnesses.kind > 0])
-    }
+    by_walker = {}
+    for walker in np.unique(witnesses.walker[witnesses.kind > 0]).tolist():
+        kinds = witnesses.kind[witnesses.walker == walker]
+        by_walker[walker] = {word: int((kinds == kind).sum()) for kind, word in _KINDS}
     summary = RunDirectory(run).read_summary()
     if not script.small:
         script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
     return archive, {count: summary.get(count) for count in _COUNTS} | {"by_walker": by_walker, "wall_s": seconds}
-
-
-_KINDS = [(kind, word) for kind, word in enumerate(WITNESSES) if word]
 
 
 def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np.ndarray) -> dict[str, Any]:
@@ -71,9 +67,7 @@ def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np
     for kind, engine in enumerate(("search", "resolved")):
         for side in range(2):
             drawn = seeds[:, 2 * kind + side]
-            counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, "control", engine)[
-                :, 0
-            ]
+            counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, "control", engine)
     found = find_kinds(counts)
     return {"tried": len(rows)} | {word: int((found == kind).sum()) for kind, word in _KINDS}
 
@@ -86,11 +80,9 @@ def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.n
         cfg = replace(SteerCfg(), generations=generations)
         for limit in (limit_m, None):
             terrains, seeds = elites_to_steer(archive, rows, script.seed + 1, generations + 1)
-            rng = np.random.default_rng(script.seed)
-            ways = find_ways(
-                crosser, script.policy, terrains, seeds[:, :-1], limit_m=limit, rng=rng, label="curve", cfg=cfg
-            )
-            counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, "curve")[:, 1]
+            how: Any = {"rng": np.random.default_rng(script.seed), "label": "curve", "cfg": cfg}
+            ways = find_ways(crosser, script.policy, terrains, seeds[:, :-1], limit_m=limit, **how)
+            counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, "curve")
             crossed = counts[:, :3] >= FAILING_GOAL_RATE * np.maximum(counts[:, 3:], 1)
             words = dict(zip(("line", "beside", "around"), crossed.mean(axis=0).tolist(), strict=True))
             points.append({"episodes": generations * cfg.samples, "limit_m": limit, "terrains": len(rows), **words})
@@ -115,9 +107,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     with Crosser(script.robot, script.compute) as crosser:
         control = measure_control(script, crosser, archive, tried)
         curve = measure_curve(script, crosser, archive, np.sort(some))
-    return script.write(
-        {"archives": {n: numbers for n, (_, numbers) in archives.items()}, "control": control, "curve": curve}
-    )
+    judged = {name: numbers for name, (_, numbers) in archives.items()}
+    return script.write({"archives": judged, "control": control, "curve": curve})
 
 
 if __name__ == "__main__":
