@@ -102,9 +102,8 @@ class RolloutResult:
         """Results that ran one after the other, or at the same time if ``at_once``; terrains, or replicas on axis 1."""
         if len(results) == 1:
             return results[0]
-        changes: dict[str, Any] = {
-            name: np.concatenate([getattr(result, name) for result in results], axis=axis) for name in results[0].arrays
-        }
+        tables = [result.arrays for result in results]
+        changes: dict[str, Any] = {name: np.concatenate([t[name] for t in tables], axis=axis) for name in tables[0]}
         if results[0].frames is not None:
             changes["frames"] = Frames.join([result.frames for result in results if result.frames is not None])
         for name in ("physics_steps", "robot_steps", "busy_steps", "wall_s"):
@@ -171,9 +170,8 @@ class Rollout:
         with genes the space decides. ``with_steering`` they may have ways of their episodes.
         """
         if num_terrains < 1 or replicas < 1 or (num_envs is not None and num_envs < 1):
-            raise ValueError(
-                f"num_terrains, replicas and num_envs must be positive, got {num_terrains}, {replicas} and {num_envs}"
-            )
+            got = f"{num_terrains}, {replicas} and {num_envs}"
+            raise ValueError(f"num_terrains, replicas and num_envs must be positive, got {got}")
         self.robot = robot
         self.cfg = cfg or CrossingCfg()
         self.num_terrains = num_terrains

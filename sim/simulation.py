@@ -102,9 +102,8 @@ class Simulation:
         scene.default_shape_cfg.mu = GROUND_FRICTION
         # The plane only carries the ground's material: kernels.contact is the only collider. Without weight in the mix,
         # it leaves the stiffness of a contact to the robot's file alone.
-        scene.add_shape_plane(
-            plane=(0.0, 0.0, 1.0, 0.0), width=0.0, length=0.0, custom_attributes={"mujoco:geom_solmix": 0.0}
-        )
+        weight = {"mujoco:geom_solmix": 0.0}
+        scene.add_shape_plane(plane=(0.0, 0.0, 1.0, 0.0), width=0.0, length=0.0, custom_attributes=weight)
         scene.replicate(builder, self.num_envs)
         self.model = scene.finalize()
 
@@ -309,10 +308,8 @@ class Simulation:
 
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""
-        ground = self.bank.ground or Ground()
-        collide_strips(
-            self.body_q, self.terrain_of_env, self.bank.terrain, self.probes, ground, self.parked, self.contacts
-        )
+        terrain, ground = self.bank.terrain, self.bank.ground or Ground()
+        collide_strips(self.body_q, self.terrain_of_env, terrain, self.probes, ground, self.parked, self.contacts)
 
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.

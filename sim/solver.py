@@ -169,9 +169,8 @@ class Dynamics:
             )
             spilled = wp.zeros((d.nworld, max(1, self._sizes.global_floats)), dtype=float)
             slope = wp.zeros((d.nworld, m.nv), dtype=float)
-        self._problem = make_struct(
-            Problem, model, m.opt, d, contacts=contacts, surfaces=surfaces, spilled_contacts=spilled
-        )
+        ours = {"contacts": contacts, "surfaces": surfaces, "spilled_contacts": spilled}
+        self._problem = make_struct(Problem, model, m.opt, d, **ours)
         self._robots = make_struct(Robots, d, parked=parked, slope=slope)
 
     def vary_bases(self, **values: Any) -> VariedRobots:

@@ -228,9 +228,8 @@ class FinetuneCfg(TrainCfg):
     def of(cls, robot: RobotCfg) -> Self:
         """The settings of a robot: robots cross, and falls cost more than in the training of its base controller."""
         tuning = robot.tuning
-        rewards = replace(
-            robot.training.rewards, termination=tuning.termination, tracking_lin_vel=tuning.tracking_lin_vel
-        )
+        weights = {"termination": tuning.termination, "tracking_lin_vel": tuning.tracking_lin_vel}
+        rewards = replace(robot.training.rewards, **weights)
         return cls(
             task=TaskCfg.of(robot, crosses=True, rewards=rewards, start_spread=tuning.start_spread),
             ppo=PpoCfg(steps_per_env=24, desired_kl=0.005, entropy=tuning.entropy, average=tuning.average),

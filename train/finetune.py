@@ -100,10 +100,8 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
     searched = RunDirectory(run).read_config()["settings"]["policy"]
     policy = cfg.policy or (None if searched == SHIPPED else searched)
     if controller_hash(policy or robot.policy_file) != archive.policy_sha256:
-        raise ValueError(
-            f"policy must be the controller that {run} searched, got {policy or SHIPPED}, whose file differs: name it "
-            "by --policy"
-        )
+        rule = f"policy must be the controller that {run} searched"
+        raise ValueError(f"{rule}, got {policy or SHIPPED}, whose file differs: name it by --policy")
     cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, find_device(options.device), **SPECIALIST)
     specialist = run / CERTIFIERS_FOLDER / f"{CERTIFIER}.pt"
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))

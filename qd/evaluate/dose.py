@@ -249,10 +249,8 @@ def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult)
     if not crossed:
         return unknown
     counted = counted_episodes(result.outcome == Outcome.INVALID)
-    hits, counts = (
-        mask.sum(axis=1).reshape(-1, len(rows))[:, crossed]
-        for mask in ((result.outcome == Outcome.GOAL) & counted, counted)
-    )
+    masks = ((result.outcome == Outcome.GOAL) & counted, counted)
+    hits, counts = (mask.sum(axis=1).reshape(-1, len(rows))[:, crossed] for mask in masks)
     drawn = resamples(len(hits), 0, _RESAMPLES)
     with np.errstate(invalid="ignore"):
         drawn_steps = [_find_crossing(rates) for rates in (drawn @ hits) / (drawn @ counts)]

@@ -109,12 +109,9 @@ def evaluate(
     others = [policy for policy in controllers.values() if policy != str(robot.policy_file)]
     scales = read_penalty_scales(robot, others[0] if others else None)
     results = cross_sets(controllers, sets, robot, compute or Compute(), episodes, reward=True, cache=cache)
-    performances = {
-        name: {controller: measure(result, scales) for controller, result in row.items()}
-        for name, row in results.items()
-    }
+    measured = {name: {by: measure(result, scales) for by, result in row.items()} for name, row in results.items()}
     about = describe_controllers(controllers, robot)
-    return make_tables(performances, sets, robot, controllers=about, episodes=episodes, seed=seed)
+    return make_tables(measured, sets, robot, controllers=about, episodes=episodes, seed=seed)
 
 
 def evaluate_tables(
@@ -132,9 +129,8 @@ def evaluate_tables(
             raise ValueError("old and new are compared on --archive: leave --sets and --independent out")
         controllers = {name: controllers[name] for name in ("old", "new")}
     check_seeds(controllers)
-    terrains, episodes = fill_sizes(
-        compute, cfg.terrains, cfg.episodes, full=(paper_terrains(robot.name), EPISODES), small=_SMALL
-    )
+    full = (paper_terrains(robot.name), EPISODES)
+    terrains, episodes = fill_sizes(compute, cfg.terrains, cfg.episodes, full=full, small=_SMALL)
     archive = independent = None
     origin: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}
     if cfg.archive is not None:
@@ -159,10 +155,8 @@ def evaluate_tables(
         check_untrained(controllers, independent.genes, str(cfg.independent))
 
     def make_report() -> dict[str, Any]:
-        cache = crossings_folder(robot)
-        tables = evaluate(
-            controllers, sets, robot=robot, compute=compute, episodes=episodes, seed=cfg.seed, cache=cache
-        )
+        settings: Any = {"episodes": episodes, "seed": cfg.seed, "cache": crossings_folder(robot)}
+        tables = evaluate(controllers, sets, robot=robot, compute=compute, **settings)
         return {**compute.origin(cfg.seed), **robot_identity(robot), "space": space.name, **origin, **tables}
 
     file, show = ("compared.json", show_comparison) if compares else ("tables.json", show_tables)

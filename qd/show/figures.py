@@ -93,10 +93,8 @@ def draw_archive(archive: Archive) -> Figure:
     count = len(archive.penalties)
     figure = new_figure(1.6 * count + 1.4, 4.6)
     axes = figure.subplots()
-    title = (
-        f"{_title(archive)}: {len(archive):,} elites, "
-        f"{archive.reachable_coverage:.1%} of {archive.cells.num_cells:,} reachable cells"
-    )
+    coverage = f"{archive.reachable_coverage:.1%} of {archive.cells.num_cells:,} reachable cells"
+    title = f"{_title(archive)}: {len(archive):,} elites, {coverage}"
     fitness = archive.fitness
     ratios = archive.ratios
     if (fresh := archive.fresh) is not None:

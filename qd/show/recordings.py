@@ -88,9 +88,8 @@ class RecordingCrosser:
         """Recordings of terrains of one :attr:`CrossingRequest.lot_key`; ``progress`` gets the share that is done."""
         policy = requests[0].policy
         terrains = Terrains.join([request.terrain for request in requests])
-        result = self._crossers[policy].cross(
-            policy, terrains, replicas=requests[0].replicas, record=True, progress=progress, invalid_ok=True
-        )
+        how: Any = {"replicas": requests[0].replicas, "record": True, "progress": progress, "invalid_ok": True}
+        result = self._crossers[policy].cross(policy, terrains, **how)
         origin: Any = {"device": self._device, "seed": requests[0].seed, "labels": [r.label for r in requests]}
         recording = make_recording(self._robot, policy, terrains, result, **origin)
         return [recording.select_terrain(k) for k in range(len(requests))]

@@ -6,16 +6,19 @@ and judged by another.
 """
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
 from qd.faults.families import find_families
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.crosser import Crosser
 from qd.workers.pipeline import Engine
-from results.make.common import Script, agreement, crossing_rates, parse
+from results.make.common import Script, parse
+from sim.files.intervals import DIFFERENCES
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 from sim.terrains.terrains import Terrains
 
@@ -24,11 +27,14 @@ HARD_RANDOM, ELITES, FIRST, SECOND = range(4)  # streams of it
 IN_MUJOCO_C = {"hard_random": 150, "elites": 40}
 """Terrains of each set that are crossed in MuJoCo C; elites were chosen by one simulator, and say less."""
 
+Rates = dict[str, NDArray[np.float64]]
+"""By measure as :func:`qd.evaluate.measures.terrain_rates` has them."""
+
 
 def cross_in_all_ways(
     script: Script, crosser: Crosser, name: str, genes: NDArray[np.float32], space: str, *, episodes: int = 40
-) -> dict[str, NDArray[np.uint8]]:
-    """Outcomes of a set's episodes by how they were crossed, (num_terrains, num_episodes); fewer terrains in MuJoCo C.
+) -> dict[str, Rates]:
+    """Rates on a set's terrains by how they were crossed; of fewer terrains in MuJoCo C.
 
     ``search`` has the first starts; ``again`` (the same settings), ``resolved`` and ``mujoco_c`` have the second.
     """
@@ -36,10 +42,10 @@ def cross_in_all_ways(
     sequences = [np.random.SeedSequence([KEY, script.seed], spawn_key=(stream,)) for stream in (FIRST, SECOND)]
     first, second = (sequence.generate_state(len(genes), np.uint32).astype(np.uint32) for sequence in sequences)
 
-    def cross(seeds: NDArray[np.uint32], engine: Engine, count: int) -> NDArray[np.uint8]:
+    def cross(seeds: NDArray[np.uint32], engine: Engine, count: int) -> Rates:
         terrains = Terrains(genes=genes[:count], seeds=seeds[:count], space=get_space(space))
         label = f"{name}, {engine}"
-        return crosser.cross(script.policy, terrains, replicas=episodes, engine=engine, label=label).outcome
+        return terrain_rates(crosser.cross(script.policy, terrains, replicas=episodes, engine=engine, label=label))
 
     return {
         "search": cross(first, "search", len(genes)),
@@ -49,21 +55,28 @@ def cross_in_all_ways(
     }
 
 
-def compare(outcome: dict[str, NDArray[np.uint8]], families: NDArray[np.int64], seed: int) -> dict[str, Any]:
+def compare(rates: dict[str, Rates], families: NDArray[np.int64], seed: int) -> dict[str, Any]:
     """Rates at the search's settings minus those of the other ways; ``both_resolved``: ours resolved minus MuJoCo C.
 
-    Of the terrains crossed in MuJoCo C, ``goal_differences`` has the difference of each, None where one is invalid.
+    ``terrains`` are those valid in both. Each rate has the mean difference (``success_bias``), its 95 % bootstrap
+    interval over ``families`` (``success_bias_interval``), and the mean absolute one (``success_difference``), None
+    without terrains. Of MuJoCo C, ``goal_differences`` has the difference of each terrain, None where one is invalid.
     """
     pairs = {name: ("search", name) for name in ("again", "resolved", "mujoco_c")}
     pairs["both_resolved"] = ("resolved", "mujoco_c")
-    numbers: dict[str, Any] = {}
-    for name, (ours, theirs) in pairs.items():
-        count = len(outcome[theirs])
-        numbers[name] = agreement(outcome[ours][:count], outcome[theirs], seed, families[:count])
-        if theirs == "mujoco_c":
-            rates = [crossing_rates(outcome[way][:count], "goal") for way in (ours, theirs)]
-            differences = np.round(rates[0] - rates[1], 4).tolist()
-            numbers[name]["goal_differences"] = [None if np.isnan(value) else value for value in differences]
+    numbers: dict[str, dict[str, Any]] = {name: {} for name in pairs}
+    for (name, (ours, theirs)), kind in product(pairs.items(), ("success", "goal")):
+        count = len(rates[theirs][kind])
+        differences = rates[ours][kind][:count] - rates[theirs][kind]
+        numbers[name] |= {
+            "terrains": int(np.isfinite(differences).sum()),
+            f"{kind}_bias": valid_mean(differences),
+            f"{kind}_bias_interval": valid_interval(differences, seed, families[:count], DIFFERENCES),
+            f"{kind}_difference": valid_mean(np.abs(differences)),
+        }
+        if (kind, theirs) == ("goal", "mujoco_c"):
+            rounded = np.round(differences, 4).tolist()
+            numbers[name]["goal_differences"] = [None if np.isnan(value) else value for value in rounded]
     return numbers
 
 
@@ -79,17 +92,14 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         "elites": (archive.genes[chosen], archive.space),
     }
     with Crosser(script.robot, script.compute, cache=script.runs / "crossings") as crosser:
-        outcome = {name: cross_in_all_ways(script, crosser, name, *terrains) for name, terrains in sets.items()}
-    fails = {
-        way: crossing_rates(outcome["elites"][way], "goal") < FAILING_GOAL_RATE
-        for way in ("search", "again", "resolved")
-    }
+        rates = {name: cross_in_all_ways(script, crosser, name, *terrains) for name, terrains in sets.items()}
     numbers: dict[str, Any] = {
-        name: compare(outcome[name], find_families(genes, get_space(space)), script.seed)
+        name: compare(rates[name], find_families(genes, get_space(space)), script.seed)
         for name, (genes, space) in sets.items()
     }
+    fails = rates["elites"]["search"]["goal"] < FAILING_GOAL_RATE
     for key, way in {"failing": "search", "failing_again": "again", "failing_resolved": "resolved"}.items():
-        numbers[key] = int((fails["search"] & fails[way]).sum())
+        numbers[key] = int((fails & (rates["elites"][way]["goal"] < FAILING_GOAL_RATE)).sum())
     return script.write(numbers)
 
 

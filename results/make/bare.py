@@ -124,14 +124,8 @@ def seconds_of(work: Callable[[], object], device: str) -> float:
         return time.perf_counter() - began
 
 
-def replay_rates(motions: list[Motion], rounds: int) -> list[float]:
-    """Physics steps a second over the robots of each motion, replayed in turns; the median of ``rounds``."""
-    seconds = np.median([[motion.replay() for motion in motions] for _ in range(rounds)], axis=0)
-    return [motion.robot_steps / float(s) for motion, s in zip(motions, seconds, strict=True)]
-
-
 def bare_rates(rollout: Rollout, terrains: Terrains, rounds: int) -> dict[str, float]:
-    """Physics steps a second, over all robots that have an episode, of contacts and solver alone.
+    """Physics steps a second, over all robots that have an episode, of contacts and solver alone; medians of rounds.
 
     Returns:
         ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and in the
@@ -144,7 +138,9 @@ def bare_rates(rollout: Rollout, terrains: Terrains, rounds: int) -> dict[str, f
     bank.set_heights(sim.bank.heights.numpy())
     motion = Motion(sim, segments)
     with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
-    walking, ground, conditions = replay_rates([motion, with_maps, motion_under_conditions(sim, segments)], rounds)
+    motions = (motion, with_maps, motion_under_conditions(sim, segments))
+    seconds = np.median([[each.replay() for each in motions] for _ in range(rounds)], axis=0)  # in turns
+    walking, ground, conditions = (each.robot_steps / float(s) for each, s in zip(motions, seconds, strict=True))
     standing = standing_rate(rollout, motion, terrains)
     return {"walking": walking, "standing": standing, "ground": ground, "conditions": conditions}
 

@@ -19,8 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from kernels.episode import Outcome
-from qd.evaluate.measures import valid_interval, valid_mean
 from qd.faults.judge import judge
 from qd.search.archive import Archive
 from qd.search.directory import RunDirectory, read_robot_archive
@@ -30,9 +28,7 @@ from qd.workers.compute import Compute
 from sim.controllers.spec import controller_identity
 from sim.device import resolve_device
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
-from sim.files.intervals import DIFFERENCES
 from sim.files.provenance import provenance, sources_sha256
-from sim.rates import counted_episodes, terrain_means
 from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.conditions.kinds import CONDITIONS
@@ -298,43 +294,6 @@ def is_current(file: Path) -> bool:
     """Whether a file was made by today's sources, and not in a trial."""
     content = read_made(file)
     return content.get("sources_sha256") == sources_sha256() and not content.get("small")
-
-
-def crossing_rates(outcome: NDArray[np.uint8], kind: str) -> NDArray[np.float64]:
-    """Rate of ``success`` (no base collision) or ``goal`` on each terrain, NaN if it is invalid, shape (num_terrains,).
-
-    Outcomes (:class:`kernels.episode.Outcome`) have shape (num_terrains, num_episodes); RUNNING counts as invalid.
-    """
-    hit = outcome != Outcome.BASE_COLLISION if kind == "success" else outcome == Outcome.GOAL
-    return terrain_means(hit, counted_episodes((outcome == Outcome.INVALID) | (outcome == Outcome.RUNNING)))
-
-
-def agreement(
-    ours: NDArray[np.uint8], theirs: NDArray[np.uint8], seed: int, families: NDArray[np.int64] | None = None
-) -> dict[str, Any]:
-    """Differences of rates between two kinds of crossings of the same terrains.
-
-    Args:
-        ours: Outcomes, shape (num_terrains, num_episodes).
-        theirs: Outcomes of the other crossings, shape (num_terrains, any number of episodes).
-        seed: Seed of the bootstrap.
-        families: Family of each terrain, shape (num_terrains,); None of independent terrains.
-
-    Returns:
-        ``terrains``, the number of terrains valid in both; for each rate the mean of ours minus theirs
-        (``success_bias``), its 95 % bootstrap interval over families (``success_bias_interval``), and the mean
-        absolute difference (``success_difference``); None without terrains.
-    """
-    numbers: dict[str, Any] = {}
-    for kind in ("success", "goal"):
-        differences = crossing_rates(ours, kind) - crossing_rates(theirs, kind)
-        numbers |= {
-            "terrains": int(np.isfinite(differences).sum()),
-            f"{kind}_bias": valid_mean(differences),
-            f"{kind}_bias_interval": valid_interval(differences, seed, families, DIFFERENCES),
-            f"{kind}_difference": valid_mean(np.abs(differences)),
-        }
-    return numbers
 
 
 if __name__ == "__main__":

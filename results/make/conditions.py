@@ -48,10 +48,8 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
 
         again = rows[rates(rows, (), "as they are") < FAILING_GOAL_RATE]
         cured = again[rates(again, range(len(space.conditions)), "nominal conditions") >= FAILING_GOAL_RATE]
-        needed = {
-            kind: rates(cured, [number], f"without {kind}") >= FAILING_GOAL_RATE
-            for number, kind in enumerate(space.conditions)
-        }
+        goals = {kind: rates(cured, [k], f"without {kind}") for k, kind in enumerate(space.conditions)}
+    needed = {kind: of_kind >= FAILING_GOAL_RATE for kind, of_kind in goals.items()}
     alone = np.sum([*needed.values()], axis=0) if len(cured) else np.zeros(0)
     examples, minima = dict[int, str](), None
     for kind, is_needed in needed.items():  # some elites that need this kind alone, faults first
@@ -89,9 +87,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     archive, numbers = search_space(script, "conditions", cfg)
     needed = needed_conditions(script, archive)
     script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
-    return script.write(
-        {"archive": numbers, "nominal_passes": needed["nominal_passes"], "conditions": needed, "dose": dose}
-    )
+    passes = needed["nominal_passes"]
+    return script.write({"archive": numbers, "nominal_passes": passes, "conditions": needed, "dose": dose})
 
 
 if __name__ == "__main__":

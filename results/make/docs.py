@@ -285,9 +285,8 @@ def spaces() -> str:
         for label, numbers in read_robots("results/{}/spaces.json").items()
         for name, counts in numbers["spaces"].items()
     }
-    return table(
-        rows, counts("elites", "corrected_elites", "failing", "confirmed", "certified", "faults", "faults_panel")
-    )
+    names = ("elites", "corrected_elites", "failing", "confirmed", "certified", "faults", "faults_panel")
+    return table(rows, counts(*names))
 
 
 def sizes(robot: str) -> str:
@@ -411,12 +410,10 @@ def league() -> str:
 def drives() -> str:
     """What stops ANYmal C with gains and with an actuator network, and which of both crosses it with which drive."""
     labels, drives = {"pd": "gains", "net": "network"}, read("results/anymal/drive.json").get("drives", {})
-    crossed = {
-        f"crossed with the {labels[drive]} by the controller of the {labels[name]}": shown(
-            "crossed", drive, name, "terrains"
-        )
-        for drive, name in product(labels, repeat=2)
-    }
+    crossed: dict[str, Column] = {}
+    for drive, name in product(labels, repeat=2):
+        label = f"crossed with the {labels[drive]} by the controller of the {labels[name]}"
+        crossed[label] = shown("crossed", drive, name, "terrains")
     rows = {f"search with the {labels[drive]}": {**row["archive"], **row} for drive, row in drives.items()}
     columns = counts("elites", "corrected_elites", "failing", "confirmed")
     return table(rows, {**columns, **crossed}, upright=True)

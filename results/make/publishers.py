@@ -1,14 +1,13 @@
 """Speeds of public controllers on level ground by their publishers' own code, in plain MuJoCo.
 
-FOLDER holds the publishers' repositories. Nothing of faultline is used, so that imports can be held against it: start,
-command and goal of a crossing are written a second time, and each function follows the files that it names.
+A folder holds the publishers' repositories. Nothing of faultline is used, so that imports can be held against it:
+start, command and goal of a crossing are written a second time, and each function follows the files that it names.
 
 A function's ``observe`` gets the state of a control step: lin_vel of the base's origin [m/s] and gyro [rad/s] in the
 base frame, quat w x y z, gravity, its direction in the base frame, q [rad] and dq [rad/s] in the publisher's order of
 joints, command vx, vy [m/s] and yaw rate [rad/s], action, the network's last, step, and memory of the episode.
 """
 
-import argparse
 import json
 import tomllib
 import xml.etree.ElementTree as ET
@@ -93,9 +92,8 @@ def _free_urdf(path: Path) -> str:
         mesh.set("filename", str(next(folder / name for folder in path.parents if (folder / name).is_file())))
     children = {child.get("link") for child in root.iter("child")}
     joint = ET.SubElement(root, "joint", name="floating", type="floating")
-    ET.SubElement(
-        joint, "child", link=next(n for link in root.iter("link") if (n := link.attrib["name"]) not in children)
-    )
+    base = next(name for link in root.iter("link") if (name := link.attrib["name"]) not in children)
+    ET.SubElement(joint, "child", link=base)
     ET.SubElement(joint, "parent", link="world")
     ET.SubElement(root, "link", name="world")
     ET.SubElement(ET.SubElement(root, "mujoco"), "compiler", strippath="false", fusestatic="true")
@@ -309,11 +307,8 @@ def unitree_rl_lab(root: Path) -> Publisher:
             rows += s.memory[name]
         return np.concatenate(rows)
 
-    model, network = (
-        root / "holosoma/src/holosoma/holosoma/data/robots/g1/g1_29dof.xml",
-        folder / "exported/policy.onnx",
-    )
-    joints = [list_driven(model)[k] for k in order]
+    model = root / "holosoma/src/holosoma/holosoma/data/robots/g1/g1_29dof.xml"
+    network, joints = folder / "exported/policy.onnx", [list_driven(model)[k] for k in order]
     return Publisher(model, network, joints, default, observe, scale, 0.001, kp[order], kd[order], offset=offset)
 
 
@@ -377,19 +372,3 @@ LEAGUE = tomllib.loads(Path(__file__).with_name("public.toml").read_text())
 """Repositories and controllers."""
 PUBLISHERS = {name: partial(_BY_NAME[row["loop"][0]], *row["loop"][1:]) for name, row in LEAGUE["controllers"].items()}
 """Each controller as its publisher runs it, from the folder of the repositories."""
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """Prints speeds of controllers at 0.75 m/s, in at most 40 s."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="folder of the publishers' repositories")
-    parser.add_argument("--only", nargs="+", choices=PUBLISHERS, default=list(PUBLISHERS))
-    parser.add_argument("--episodes", type=int, default=20)
-    args = parser.parse_args(argv)
-    for name in args.only:
-        walked = walk(PUBLISHERS[name](args.folder.resolve()), episodes=args.episodes, speed=0.75, duration_s=40.0)
-        print(f"{name:20} {walked['speed']:.3f} m/s, {walked['goal']:4.0%} reach the goal", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.evaluate import cross_sets
+from qd.evaluate.measures import terrain_rates
 from qd.evaluate.sets import generated_set, paper_terrains, plain_set
-from results.make.common import SEEDS, Script, crossing_rates, file_name, parse
+from results.make.common import SEEDS, Script, file_name, parse
 from results.make.tables import MIXES, SIZES, train, train_controllers
 from train.cfg import FinetuneCfg, PpoCfg, TaskCfg
 
 RECIPES = ("today's", "the base's own")
-
-
 TRAININGS = {f"{recipe}: {kind}": (recipe, kind) for recipe in RECIPES for kind in MIXES}
 
 
@@ -53,15 +52,13 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     crossed = cross_sets(controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, cache=cache)
     goal: dict[str, dict[str, float]] = {name: {} for name in controllers}
     for name, controller in product(sets, controllers):
-        rates = crossing_rates(crossed[name][controller].outcome, "goal")
-        goal[controller][name] = float(np.nanmean(rates))
+        goal[controller][name] = float(np.nanmean(terrain_rates(crossed[name][controller])["goal"]))
     score = {
         recipe: float(np.mean([[*goal[name].values()] for name in names if TRAININGS[name][0] == recipe]))
         for recipe in dict.fromkeys(TRAININGS[name][0] for name in names)
     }
-    return script.write(
-        {"score": score, "goal": goal, "terrains": {name: len(of_set) for name, of_set in sets.items()}}
-    )
+    counts = {name: len(of_set) for name, of_set in sets.items()}
+    return script.write({"score": score, "goal": goal, "terrains": counts})
 
 
 if __name__ == "__main__":

@@ -45,9 +45,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     counts = (1,) if script.small else [1 << k for k in range(devices.bit_length())]
     alone = Compute(script.device, workers="1")
     search = preset("paper" if on_gpu else "small", script.robot)
-    one_process = PipelineCfg(
-        compute=alone, robot=script.robot, policy=script.policy, num_terrains=terrains, replicas=replicas
-    )
+    sizes: Any = {"num_terrains": terrains, "replicas": replicas}
+    one_process = PipelineCfg(compute=alone, robot=script.robot, policy=script.policy, **sizes)
     paper_size = 4 if script.small else search.scheduler.num_terrains
     shared = replace(one_process, num_terrains=paper_size, replicas=search.replicas)
     alone_s, shared_alone_s = (time_evaluation(cfg, script.seed, rounds) for cfg in (one_process, shared))

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from qd.evaluate.sets import read_space
 from qd.faults.families import rank
 from qd.faults.judge import judge
 from qd.search.archive import Archive
@@ -10,30 +11,20 @@ from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.settings import SearchCfg
 from results.make.common import COUNTS, Script, parse
-from sim.robots.robot import ROBOTS
-from sim.terrains.spaces.registry import get_space
 
 SPACES = ("super_gaussian", "super_gaussian+friction", "course")
 
 
-def causes_of(archive: Archive) -> dict[str, int]:
-    """How many elites fail by which cause, the commonest first."""
-    half_width = ROBOTS[archive.robot].footprint[1]
-    ranking = rank(archive, get_space(archive.space, archive.space_sha256), half_width=half_width, judged=True)
-    return {cause: len(rows) for cause, rows in ranking.by_cause().items()}
-
-
 def search_space(script: Script, name: str, cfg: SearchCfg) -> tuple[Archive, dict[str, Any]]:
-    """The archive of a search in the folder ``name``, judged by all stages but varied conditions, and its numbers."""
+    """The archive of a search in the folder ``name``, judged, and its numbers; causes are the commonest first."""
     run = script.runs / name
     search(cfg, run, script.compute)
     stages = ("fresh",) if script.small else ("fresh", "resolved", "others")
     archive = judge(run, stages=stages, compute=script.compute)
     summary = RunDirectory(run).read_summary()
-    return archive, {
-        **{count: summary.get(count) for count in ("iterations", "reachable_coverage", *COUNTS)},
-        "causes": causes_of(archive),
-    }
+    numbers = {count: summary.get(count) for count in ("iterations", "reachable_coverage", *COUNTS)}
+    by_cause = rank(archive, read_space(archive), half_width=script.robot.half_width, judged=True).by_cause()
+    return archive, {**numbers, "causes": {cause: len(rows) for cause, rows in by_cause.items()}}
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

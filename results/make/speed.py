@@ -61,10 +61,9 @@ def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> t
 
 def make_rollout(script: Script, num_terrains: int, num_envs: int, replicas: int) -> Rollout:
     """A simulation of the shipped controller in this process."""
+    sizes: Any = {"num_terrains": num_terrains, "replicas": replicas}
     compute = Compute(script.device, workers="1", num_envs=num_envs)
-    cfg = PipelineCfg(
-        compute=compute, robot=script.robot, policy=script.policy, num_terrains=num_terrains, replicas=replicas
-    )
+    cfg = PipelineCfg(compute=compute, robot=script.robot, policy=script.policy, **sizes)
     rollout = build_simulator(cfg, num_terrains)
     assert isinstance(rollout, Rollout)
     return rollout
@@ -126,14 +125,8 @@ def time_crossings(
     drawn = load_space(space)
     genes = drawn.hard_random(num_terrains, seed)
     compute, policy = Compute(device, workers="1", num_envs=num_envs), str(robot.policy_file)
-    cfg = PipelineCfg(
-        compute=compute,
-        robot=robot,
-        policy=policy,
-        num_terrains=max(1, num_terrains * 4 // each),
-        space=space,
-        replicas=REPLICAS,
-    )
+    sizes: Any = {"num_terrains": max(1, num_terrains * 4 // each), "replicas": REPLICAS}
+    cfg = PipelineCfg(compute=compute, robot=robot, policy=policy, space=space, **sizes)
     with open_pipeline(cfg) as evaluate:
         result = evaluate(Terrains(genes=genes, seeds=np.arange(num_terrains, dtype=np.uint32), space=drawn))
     rate = result.outcome.size / result.wall_s

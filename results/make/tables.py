@@ -16,19 +16,11 @@ from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
-from qd.evaluate.measures import kind_mean
+from qd.evaluate.measures import kind_mean, terrain_rates
 from qd.evaluate.sets import elites_sha256, make_sets, paper_terrains
 from qd.evaluate.tables import by_kind
 from qd.search.archive import read_archive
-from results.make.common import (
-    SEEDS,
-    Script,
-    crossing_rates,
-    parse,
-    publish_controller,
-    published_controllers,
-    read_made,
-)
+from results.make.common import SEEDS, Script, parse, publish_controller, published_controllers, read_made
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import write_atomically
 from sim.files.npz import npz_bytes
@@ -37,7 +29,6 @@ from train.finetune import finetune
 from train.ppo.checkpoint import CHECKPOINT
 
 MIXES = {"C-HC": "hand-crafted", "C-HR": "hard-random", "C-G": "generated"}
-
 SIZES: dict[str, dict[str, int]] = {"tables": {**LARGE, "iterations": 1200}, "tables_paper_sizes": {}}
 """Robots, terrains at a time and iterations by the file that they are of; the paper's are the default."""
 TRAININGS = {f"tables: {name}-{seed}": ("tables", name, seed) for name in MIXES for seed in SEEDS}
@@ -98,15 +89,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     for file in SIZES:
         trainings = [training for training, (of_file, *_) in TRAININGS.items() if of_file == file]
         controllers = {"base": script.policy, **train_controllers(script, trainings)}
-        if file == "tables" and is_hardened_here(script, published.get("hardened")):
-            controllers["hardened"] = published["hardened"]
+        rounds = script.read_so_far(script.results / "rounds.json").get("rounds", ())  # of today's sources
+        hardened = published.get("hardened")
+        if file == "tables" and hardened and controller_hash(hardened) in [row["policy_sha256"] for row in rounds]:
+            controllers["hardened"] = hardened
         write_tables(replace(script, out=script.out.with_stem(file)), controllers)
-
-
-def is_hardened_here(script: Script, policy: str | None) -> bool:
-    """Whether a controller is of rounds.json, which today's sources made."""
-    rounds = script.read_so_far(script.results / "rounds.json").get("rounds", ())
-    return policy is not None and controller_hash(policy) in [row["policy_sha256"] for row in rounds]
 
 
 def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
@@ -122,10 +109,7 @@ def write_tables(script: Script, controllers: Mapping[str, str]) -> None:
     sets = make_sets(cfg.sets, terrains, cfg.seed, **archives)
     cache = {"cache": crossings_folder(script.robot), "reward": True}
     crossed = cross_sets(controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, **cache)
-    rates = {
-        name: {controller: crossing_rates(result.outcome, "goal") for controller, result in row.items()}
-        for name, row in crossed.items()
-    }
+    rates = {name: {by: terrain_rates(result)["goal"] for by, result in row.items()} for name, row in crossed.items()}
     arrays = {f"{name}_goal": np.array(list(of_set.values())) for name, of_set in rates.items()}
     family = {  # each terrain is its own where they are independent
         name: np.arange(len(of_set)) if of_set.families is None else of_set.families for name, of_set in sets.items()

@@ -124,9 +124,8 @@ def make_terrains(
     None.
     """
     device = device or host_device()
-    bank = TerrainBank(
-        len(genes), device=device, with_ground=bool(space.ground), with_conditions=bool(space.conditions)
-    )
+    maps = {"with_ground": bool(space.ground), "with_conditions": bool(space.conditions)}
+    bank = TerrainBank(len(genes), device=device, **maps)
     with wp.ScopedDevice(device):
         bank.set(Terrains(genes=genes, seeds=np.zeros(len(genes), np.uint32), space=space))
         return np.array(bank.heights.numpy()), bank.ground_maps()

@@ -58,10 +58,8 @@ def corridor_maps(genes: torch.Tensor, space: TerrainSpace) -> torch.Tensor:
     ground = make_ground(len(genes), device)
     with wp.ScopedDevice(device):
         space.lay_ground(wp.from_torch(genes.contiguous()), ground)
-    patches = {
-        "friction": 1.0 - wp.to_torch(ground.friction),
-        "softness": wp.to_torch(ground.time_constant) / float(MAX_TIME_CONSTANT_S),
-    }
+    softness = wp.to_torch(ground.time_constant) / float(MAX_TIME_CONSTANT_S)
+    patches = {"friction": 1.0 - wp.to_torch(ground.friction), "softness": softness}
     row, col = (
         patch_index(low / SPACING + np.arange(count) * (NODE_SPACING / SPACING), nodes - 1, num_patches)
         for (low, _), count, nodes, num_patches in zip((Y, X), SHAPE, (NUM_ROWS, NUM_COLS), (ROWS, COLS), strict=True)

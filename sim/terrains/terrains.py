@@ -150,10 +150,8 @@ class Terrains:
         return len(self.seeds)
 
     def __getitem__(self, rows: Rows) -> "Terrains":
-        chosen: dict[str, Any] = {
-            name: value[rows] for name, value in vars(self).items() if isinstance(value, np.ndarray | GroundMaps)
-        }
-        return replace(self, **chosen)
+        values = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray | GroundMaps)}
+        return replace(self, **{name: value[rows] for name, value in values.items()})
 
     @staticmethod
     def join(parts: Sequence["Terrains"]) -> "Terrains":

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
+from qd.evaluate.measures import terrain_rates
 from qd.search import loop
 from qd.workers import crosser
 from results.make import agreement, bare, common, docs, speed, tables
@@ -21,30 +22,20 @@ from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 from tests.qd.searches import without_figures
-from tests.qd.stand_in import Stub, make_result
+from tests.qd.stand_in import Stub, make_result, result_of
 
 MAKE = Path(common.__file__).parent
 SCRIPTS = (
-    "base",
-    "conditions",
-    "dose",
-    "left",
-    "minimal",
-    "pack",
-    "penalty_ratios",
-    "search",
-    "search_noise",
-    "spaces",
-    "speed",
-    "tables",
-)
+    "base", "conditions", "dose", "left", "minimal", "pack", "penalty_ratios", "search", "search_noise", "spaces",
+    "speed", "tables",
+)  # fmt: skip
 """Those that call all that the others call."""
 FILES = {name: f"{name}.json" for name in SCRIPTS} | {"minimal": "archive/minimal.json", "pack": "pack/pack.json"}
 
 GOAL, HIT, LATE, INVALID = Outcome.GOAL, Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.INVALID
 
-OURS = np.uint8([[GOAL, GOAL, HIT, LATE], [HIT, HIT, HIT, INVALID], [INVALID] * 4, [GOAL] * 4])
-THEIRS = np.uint8([[GOAL, LATE, LATE, LATE], [GOAL, HIT, HIT, HIT], [GOAL] * 4, [Outcome.RUNNING] * 4])
+OURS = terrain_rates(result_of([[GOAL, GOAL, HIT, LATE], [HIT, HIT, HIT, INVALID], [INVALID] * 4, [GOAL] * 4]))
+THEIRS = terrain_rates(result_of([[GOAL, LATE, LATE, LATE], [GOAL, HIT, HIT, HIT], [GOAL] * 4, [INVALID] * 4]))
 
 
 @contextmanager
@@ -143,9 +134,8 @@ def test_a_file_is_not_written_if_the_sources_changed_or_it_cannot_be(tmp_path, 
 def test_robots_that_have_ended_are_left_out_of_bare_physics(anymal, device):
     # Two robots for 60 control steps, of which the first 10 of every 20 are replayed. One ends behind the 15th: of
     # (2 + 1 + 1) * 10 control steps, 4 physics steps each, count.
-    rollout = Rollout(
-        replace(anymal, max_duration_s=1.2), anymal.policy_file, num_terrains=1, replicas=2, device=device
-    )
+    robot = replace(anymal, max_duration_s=1.2)
+    rollout = Rollout(robot, anymal.policy_file, num_terrains=1, replicas=2, device=device)
     steps, step = [], rollout.control_step
 
     def end_one():
@@ -174,19 +164,26 @@ def test_means_over_seeds():
     assert numbers["elites"] == 3
     assert numbers["elites_interval"] == pytest.approx([3 - half, 3 + half], rel=1e-3)
     assert common.mean_over_seeds("faults", [1, None]) == {"faults": None, "faults_interval": None}
+    assert common.t_interval(np.array([1.0])) is None
 
 
 def test_rates_are_of_valid_episodes():
-    np.testing.assert_array_equal(common.crossing_rates(OURS, "success"), [0.75, 0.0, np.nan, 1.0])
-    np.testing.assert_array_equal(common.crossing_rates(OURS, "goal"), [0.5, 0.0, np.nan, 1.0])
-    assert np.isnan(common.crossing_rates(THEIRS[3:], "goal"))  # they still run
-    rates = common.crossing_rates(np.uint8([[INVALID, GOAL, GOAL, HIT], [INVALID, INVALID, GOAL, GOAL]]), "goal")
-    np.testing.assert_array_equal(rates, [2 / 3, np.nan])  # more than a quarter of the second's are invalid
+    np.testing.assert_array_equal(OURS["success"], [0.75, 0.0, np.nan, 1.0])
+    np.testing.assert_array_equal(OURS["goal"], [0.5, 0.0, np.nan, 1.0])
+    rates = terrain_rates(result_of([[INVALID, GOAL, GOAL, HIT], [INVALID, INVALID, GOAL, GOAL]]))
+    np.testing.assert_array_equal(rates["goal"], [2 / 3, np.nan])  # more than a quarter of the second's are invalid
+
+
+def compare(chosen, families=None):
+    """How some terrains by other episodes compare with ours, crossed in all other ways alike."""
+    ours, theirs = ({name: values[chosen] for name, values in rates.items()} for rates in (OURS, THEIRS))
+    ways = {"search": ours, "resolved": ours, "again": theirs, "mujoco_c": theirs}
+    return agreement.compare(ways, np.arange(4)[chosen] if families is None else families, 0)["again"]
 
 
 def test_bias_and_distance_are_of_terrains_that_both_have():
     # Success .75 and 0 against 1 and .25: both .25 lower. Goal .5 and 0 against .25 and .25: once more, once less.
-    numbers = common.agreement(OURS, THEIRS, seed=0)
+    numbers = compare(slice(None))
     assert numbers["terrains"] == 2
     assert numbers["success_bias"] == -0.25 and numbers["success_difference"] == 0.25
     low, high = numbers["success_bias_interval"]  # two terrains say little, though they agree
@@ -194,14 +191,16 @@ def test_bias_and_distance_are_of_terrains_that_both_have():
     assert numbers["goal_bias"] == 0.0 and numbers["goal_difference"] == 0.25
     low, high = numbers["goal_bias_interval"]
     assert -0.8 < low < -0.25 and high == pytest.approx(-low)
-    assert common.agreement(OURS, THEIRS, seed=0, families=np.zeros(4, np.int64))["goal_bias_interval"] is None
-    numbers = common.agreement(OURS[2:], THEIRS[2:], seed=0)
+    assert compare(slice(None), families=np.zeros(4, np.int64))["goal_bias_interval"] is None
+    numbers = compare(slice(2, None))
     assert numbers.pop("terrains") == 0 and set(numbers.values()) == {None}
 
 
 def test_agreement_with_mujoco_c_has_the_difference_of_each_terrain_crossed_there():
-    outcome = {"search": OURS, "again": OURS, "resolved": OURS[[1, 0, 2, 3]], "mujoco_c": THEIRS[:3]}
-    numbers = agreement.compare(outcome, np.arange(4), 0)
+    swapped = {name: values[[1, 0, 2, 3]] for name, values in OURS.items()}
+    in_mujoco_c = {name: values[:3] for name, values in THEIRS.items()}
+    ways = {"search": OURS, "again": OURS, "resolved": swapped, "mujoco_c": in_mujoco_c}
+    numbers = agreement.compare(ways, np.arange(4), 0)
     # Goal .5, 0 and invalid, resolved 0, .5 and invalid, against .25, .25 and 1
     assert numbers["mujoco_c"]["goal_differences"] == [0.25, -0.25, None]
     assert numbers["both_resolved"]["goal_differences"] == [-0.25, 0.25, None]
@@ -233,9 +232,8 @@ def test_a_table_is_written_between_its_marks(tmp_path, monkeypatch):
 
 def test_a_cell_is_a_number_with_its_interval():
     rows = {"a": {"share": 0.5, "share_interval": [0.2, 1.0]}, "b": {"share": 0.25}}
-    made = docs.table(
-        rows, {"cm": docs.shown("share", form=".1f", factor=100), "rate": docs.shown("share", form=".2f")}, upright=True
-    )
+    columns = {"cm": docs.shown("share", form=".1f", factor=100), "rate": docs.shown("share", form=".2f")}
+    made = docs.table(rows, columns, upright=True)
     assert made.splitlines()[2:] == ["| cm | 50.0 (20.0 to 100.0) | 25.0 |", "| rate | 0.50 (0.20 to 1.00) | 0.25 |"]
 
 
@@ -250,9 +248,3 @@ def test_results_name_no_path_of_the_machine_that_made_them():
     files = [file for kind in ("*.json", "*.jsonl") for file in MAKE.parent.rglob(kind)]
     place = re.compile(r"(?<![\w.])/(tmp|home|root|work|opt|mnt|usr)/")
     assert files and [str(file) for file in files if place.search(file.read_text())] == []
-
-
-def test_t_interval_by_hand():
-    # Mean 2, standard deviation 1; Student's quantile of 2 degrees of freedom is 4.302653: 2 -+ 4.302653 / sqrt(3).
-    assert common.t_interval(np.array([1.0, 2.0, 3.0])) == pytest.approx([-0.484138, 4.484138], abs=1e-6)
-    assert common.t_interval(np.array([1.0])) is None

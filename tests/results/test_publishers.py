@@ -32,9 +32,8 @@ def test_a_dog_that_stands_goes_nowhere(dog, drive):
 
 def test_states_of_an_onnx_are_fed_back(tmp_path):
     # action = row + h, and it is the next h: 1 2, then 2 4.
-    row, h, action, out = (
-        helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, 2]) for n in ("row", "h", "a", "h_out")
-    )
+    names = ("row", "h", "a", "h_out")
+    row, h, action, out = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 2]) for name in names)
     nodes = [helper.make_node("Add", ["row", "h"], ["a"]), helper.make_node("Identity", ["a"], ["h_out"])]
     model = helper.make_model(helper.make_graph(nodes, "net", [row, h], [action, out]), ir_version=8)
     model.opset_import[0].version = 17

@@ -130,9 +130,8 @@ def plain_layers(network: Any, name: str) -> MlpPolicy:
         return network
     module = getattr(network, "module", None)
     tensors = module.state_dict() if module is not None and not hasattr(network, "reset") else {}
-    layers = [
-        key.removesuffix("weight") for key, value in tensors.items() if key.endswith("weight") and value.ndim == 2
-    ]
+    weights = [key for key, value in tensors.items() if key.endswith("weight") and value.ndim == 2]
+    layers = [key.removesuffix("weight") for key in weights]
     state = {}
     for k, layer in enumerate(layers):
         state |= {f"mlp.{2 * k}.{key}": tensors[layer + key] for key in ("weight", "bias") if layer + key in tensors}

@@ -143,9 +143,8 @@ def check_resumed(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]
     if different := differences(before, now):
         raise ValueError(f"{run_dir} was begun with other settings: {', '.join(different)}: give those")
     if saved["iter"] > settings["iterations"]:
-        raise ValueError(
-            f"iterations must be at least {saved['iter']}, which {run_dir} has done, got {settings['iterations']}"
-        )
+        rule = f"iterations must be at least {saved['iter']}, which {run_dir} has done"
+        raise ValueError(f"{rule}, got {settings['iterations']}")
 
 
 def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
@@ -196,9 +195,8 @@ class Training:
         self.averaged_from = max(round((1.0 - cfg.ppo.average) * cfg.iterations), self.critic_iterations)
         ranks = Ranks.from_environment()
         tiles = mix and (mix.next() if saved is None else mix.restore(saved["mix"]))
-        self.task = CommandTask(
-            robot, cfg.task, num_envs=cfg.num_envs, device=device, seed=cfg.seed + _SEED_STEP * ranks.rank, tiles=tiles
-        )
+        seed = cfg.seed + _SEED_STEP * ranks.rank
+        self.task = CommandTask(robot, cfg.task, num_envs=cfg.num_envs, device=device, seed=seed, tiles=tiles)
         # On given terrains every episode is whole, because the crossings of each terrain are counted.
         env = CommandVecEnv(self.task, start and start.controller)
         self.learner = Learner(env, cfg.ppo, seed=cfg.seed, random_ages=mix is None)

@@ -110,9 +110,8 @@ class CommandTask:
         tiles = self.tiles
         ground = tiles.ground
         with_conditions = ground is not None and ground.conditions is not None
-        bank = TerrainBank(
-            len(tiles.heights), device=self.device, with_ground=ground is not None, with_conditions=with_conditions
-        )
+        maps = {"with_ground": ground is not None, "with_conditions": with_conditions}
+        bank = TerrainBank(len(tiles.heights), device=self.device, **maps)
         bank.set_heights(tiles.heights, ground=ground)
         friction = rng.uniform(*self.cfg.friction, self.num_envs).astype(np.float32)
         mass = rng.uniform(*self.cfg.added_base_mass, self.num_envs).astype(np.float32)

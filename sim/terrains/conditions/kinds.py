@@ -136,11 +136,8 @@ def round_steps(seconds: float, dt: float) -> int:
 
 def _direction_text(values: Array, form: str, least: float, directions: Sequence[str]) -> str:
     """Two numbers along the axes, each with one of four ``directions``: ahead, back, left, right."""
-    return " and ".join(
-        f"{abs(value):{form}} {directions[2 * axis + (value < 0)]}"
-        for axis, value in enumerate(values)
-        if abs(value) >= least
-    )
+    large = [(axis, value) for axis, value in enumerate(values) if abs(value) >= least]
+    return " and ".join(f"{abs(value):{form}} {directions[2 * axis + (value < 0)]}" for axis, value in large)
 
 
 @wp.func

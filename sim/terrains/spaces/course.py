@@ -108,11 +108,8 @@ class Course(ShippedSpace):
 
     def spans(self, genes: ArrayLike) -> tuple[tuple[str, float, float], ...]:
         """Each element but flat ground, with where it begins and ends [m]."""
-        return tuple(
-            (kind.text(e), SPACING * e["first"], SPACING * (e["first"] + e["cells"]))
-            for kind, e in self._laid(genes)
-            if e["kind"]
-        )
+        laid = [(kind.text(element), element) for kind, element in self._laid(genes) if element["kind"]]
+        return tuple((text, SPACING * e["first"], SPACING * (e["first"] + e["cells"])) for text, e in laid)
 
 
 def _middle_gene(number: Any, count: float) -> Any:
