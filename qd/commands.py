@@ -184,7 +184,8 @@ class JudgeCommand(_RunFlags):
     stages: tuple[str, ...] = ("fresh", "resolved", "others")
     """Some of fresh, resolved, others, steered, varied, mujoco_c, in the order in which to do them."""
     steered: PositiveInt | None = None
-    """Terrains for which steered seeks ways at most, the hardest first; 20 on the CPU and all on a GPU if left out."""
+    """Terrains for which steered seeks ways at most, the hardest of each family first; 20 on the CPU and all on a GPU
+    if left out."""
     skip_level_ground: bool = False
     """Judge though the controller of a robot of yours does not cross level ground."""
 

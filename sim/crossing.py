@@ -37,6 +37,7 @@ class CrossingCfg:
     lowest_command: tuple[float, float, float] = (0.0, -0.5, -1.0)
     """Least command of a steered episode: v_x, v_y [m/s], yaw rate [rad/s]."""
     highest_command: tuple[float, float, float] = (1.0, 0.5, 1.0)
+    """Ahead a robot may go as fast as it is commanded elsewhere, if that is faster (:func:`find_highest_command`)."""
     lower: tuple[float, float] = (-2.0, -2.0)
     upper: tuple[float, float] = (18.0, 10.0)
     penalties_from_s: float = 0.0
@@ -50,12 +51,19 @@ class CrossingCfg:
     time is over or it ends otherwise; without it, robots stop at the goal."""
 
 
+def find_highest_command(cfg: CrossingCfg, robot: RobotCfg) -> tuple[float, float, float]:
+    """Largest command of a steered episode of a robot: v_x, v_y [m/s], yaw rate [rad/s]."""
+    ahead, aside, turn = cfg.highest_command
+    return max(ahead, robot.speed), aside, turn
+
+
 def make_task(cfg: CrossingCfg, robot: RobotCfg, *, to_goal: bool = True) -> Task:
     """The goal, command and ends of a crossing as a kernel argument; without ``to_goal`` the goal ends none."""
     return make_struct(
         Task,
         cfg,
         speed=robot.speed,
+        highest_command=find_highest_command(cfg, robot),
         goal_radius=cfg.goal_radius if to_goal else 0.0,  # no distance is smaller
         max_steps=round(robot.max_duration_s / robot.physics_dt),
         first_counted_step=round(cfg.penalties_from_s / robot.physics_dt) + 1,

@@ -27,7 +27,7 @@ from qd.faults.numbers import (
     fresh_numbers,
 )
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
-from qd.faults.steer import SteerCfg, measure_line, seek_witnesses
+from qd.faults.steer import LINE_M, SteerCfg, measure_line, seek_witnesses
 from qd.search.archive import (
     ARCHIVE_FILE,
     OUTCOMES,
@@ -234,10 +234,14 @@ class Steered(Stage):
     asks_certifiers = True
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
-        """The archive with witnesses of its confirmed elites that no controller certifies, the hardest first."""
+        """The archive with witnesses of its confirmed elites that no controller certifies, at first one a family."""
         search, crosser = judging.search, judging.crosser
         open_cases = archive.confirmed if archive.resolved_outcomes.any() else archive.failing
-        rows = np.flatnonzero(open_cases & ~archive.certified_by_controllers)[: judging.most_steered]
+        first, others = split_families(archive, np.flatnonzero(open_cases & ~archive.certified_by_controllers))
+        rows = np.sort(np.concatenate([np.sort(first), others])[: judging.most_steered])
+        if not len(rows):
+            print("There is no terrain left for which to seek a way.", flush=True)
+            return replace(archive, witnesses=archive.witnesses or no_witnesses(len(archive), LINE_M))
         crossed = {*zip(archive.certifiers, archive.certifier_sha256, strict=True)}
         walkers = {SEARCHED: search.policy}
         walkers |= {name: f for name, f in judging.certifiers.items() if (name, controller_hash(f)) in crossed}
@@ -253,7 +257,7 @@ class Steered(Stage):
         found = [f"{(some.kind == kind).sum()} {words}" for kind, words in _WITNESS_WORDS.items()]
         print(f"Steered, robots cross {', '.join(found)}, of {len(rows)} terrains not certified before.", flush=True)
         before = archive.witnesses or no_witnesses(len(archive), limit_m)
-        witnesses = before.updated(rows, some)
+        witnesses = replace(before.updated(rows, some), limit_m=limit_m)
         mujoco_c = archive.mujoco_c if np.array_equal(witnesses.way, before.way) else None
         return replace(archive, witnesses=witnesses, mujoco_c=mujoco_c)
 
@@ -401,10 +405,15 @@ class InMujocoC(OfFaults):
 def draw_faults(archive: Archive, seed: int, count: int) -> NDArray[np.int64]:
     """Rows of at most ``count`` random faults, a fault of each family before a second one of any."""
     rng = np.random.default_rng(np.random.SeedSequence([seed], spawn_key=(Stream.MUJOCO_C,)))
-    rows = rng.permutation(np.flatnonzero(archive.is_fault))
+    first, others = split_families(archive, rng.permutation(np.flatnonzero(archive.is_fault)))
+    return np.concatenate([rng.permutation(first), others])[:count]
+
+
+def split_families(archive: Archive, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first row of each family, the families in order, and the other rows, in their order."""
     assert archive.family is not None
     _, first = np.unique(archive.family[rows], return_index=True)
-    return np.concatenate([rng.permutation(rows[first]), np.delete(rows, first)])[:count]
+    return rows[first], np.delete(rows, first)
 
 
 def is_decided(counts: NDArray[np.int64], episodes: int) -> NDArray[np.bool_]:

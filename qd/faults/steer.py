@@ -20,7 +20,8 @@ from qd.search.fitness import FAILING_GOAL_RATE
 from qd.search.progress import Bar
 from qd.workers.crosser import Crosser
 from qd.workers.pipeline import Engine, Progress
-from sim.crossing import CrossingCfg
+from sim.controllers.described import read_speed_limits
+from sim.crossing import CrossingCfg, find_highest_command
 from sim.rates import MAX_INVALID_SHARE
 from sim.rollout import RolloutResult
 from sim.terrains.terrains import Terrains
@@ -123,12 +124,13 @@ def find_ways(
     """
     shape = (len(terrains), SEGMENTS, len(STEERING))
     mean = np.zeros(shape)
-    mean[..., 0] = crosser.robot.speed
     offset_std = cfg.offset_std if limit_m is not None else 4.0 * cfg.offset_std
     std = np.broadcast_to([cfg.speed_std, offset_std, cfg.heading_std], shape).copy()
     offset = limit_m or CrossingCfg.goal[1]
-    low = [CrossingCfg.lowest_command[0], -offset, -np.pi / 2]
-    high = [CrossingCfg.highest_command[0], offset, np.pi / 2]
+    speeds = CrossingCfg.lowest_command[0], find_highest_command(CrossingCfg(), crosser.robot)[0]
+    slowest, fastest = np.clip(speeds, *read_speed_limits(policy))  # what its description limits it is not told
+    low, high = [slowest, -offset, -np.pi / 2], [fastest, offset, np.pi / 2]
+    mean[..., 0] = np.clip(crosser.robot.speed, slowest, fastest)
     mix = mix_segments(SEGMENTS, cfg)
     with Bar(label, cfg.generations) as bar:
         for generation in range(cfg.generations):

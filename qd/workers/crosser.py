@@ -68,6 +68,7 @@ class Crosser(ExitStack):
         self._cache = None if cache is None else Cache(cache)
         self._stored: dict[str, StoredCrossings] = {}
         self._opened: tuple[PipelineCfg, Pipeline] | None = None
+        self._keeps = False  # whether anything that was asked for is in the cache
 
     def cross(
         self,
@@ -113,6 +114,7 @@ class Crosser(ExitStack):
             )  # fmt: skip
         stored = None if record or terrains.steering is not None else self._stored_crossings(cfg, terrains)
         results = list(stored.read(terrains)) if stored else []
+        self._keeps |= bool(results)
         done = np.concatenate([np.zeros(0, np.intp), *(numbers for numbers, _ in results)])
         missing = np.setdiff1d(np.arange(len(terrains)), done)
         try:
@@ -120,9 +122,11 @@ class Crosser(ExitStack):
                 numbers = missing[lot]
                 if stored:
                     stored.write(terrains[numbers], result)
+                    self._keeps = True
                 results.append((numbers, result))
         except KeyboardInterrupt:
-            kept = "; what was crossed is kept, and the same command goes on" if stored else ""
+            before = "" if stored else " before this step"
+            kept = f"; what was crossed{before} is kept, and the same command goes on" if self._keeps else ""
             raise Interrupted(f"Stopped{kept}.") from None
         order = np.argsort(np.concatenate([numbers for numbers, _ in results]))
         result = RolloutResult.join([result for _, result in results])[order]

@@ -11,10 +11,12 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import torch
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from kernels.observation import ANG_VEL_SCALE, FORCE_SCALE, JOINT_VEL_SCALE, LIN_VEL_SCALE, SCAN_OFFSET, SCAN_SCALE
 from sim.controllers.formats.rsl_rl import ACTIVATIONS
 from sim.controllers.runner import is_graph_safe
+from sim.controllers.spec import ControllerSpec
 from sim.files.settings import NonNegativeInt, PositiveFloat, from_builtins, read_toml, to_toml
 from sim.robots.robot import RobotCfg, needed_senses
 
@@ -314,10 +316,8 @@ class Described(torch.nn.Module):
         for term, indices in zip(cfg.observation, self._columns, strict=True):
             shift = term.offset or 0.0 if term.term in ("scan", "joint_pos") else 0.0
             zeros = [pose[k] if term.term == "joint_pos" and term.offset is None else shift for k in indices]
-            limits = np.broadcast_to(math.inf if term.limit is None else term.limit, 3)
-            sizes = limits[[k % 3 for k in indices]]  # only those of a command differ
-            low, high = np.clip([-sizes, sizes], *_limits(term.clip))
-            columns += zip(zeros, low, high, np.broadcast_to(term.scale, len(indices)), strict=True)
+            limits = _told_limits(term)[:, [k % 3 for k in indices]]  # only those of a command differ
+            columns += zip(zeros, *limits, np.broadcast_to(term.scale, len(indices)), strict=True)
         self._index = [torch.tensor(indices, device=device) for indices in self._columns]
         constants = (term.at or term.value or term.offset or 0.0 for term in cfg.observation)
         self._constants = [constant(np.atleast_1d(values)) for values in constants]
@@ -445,6 +445,21 @@ class Described(torch.nn.Module):
         memory.sent.copy_(queue[:, :-1])
         actions[:, self._joints] = (self._offset + self._radians * queue[:, -1] - self._pose) / self.robot.action_scale
         return actions
+
+
+def read_speed_limits(policy: str | Path) -> tuple[float, float]:
+    """Least and largest speed ahead that a controller is told [m/s]; infinite where no description limits it."""
+    file = ControllerSpec.parse(policy).file
+    terms = read_controller(Path(file)).observation if file is not None and file.endswith(".toml") else ()
+    told = [term for term in terms if term.term == "command" and "v_x" in (term.order or "")]
+    low, high = np.array([_told_limits(term)[:, 0] for term in told] or [(-math.inf, math.inf)]).T
+    return float(low.max()), float(high.min())
+
+
+def _told_limits(term: Term) -> NDArray[np.float64]:
+    """Lower and upper limit of a term's v_x, v_y and yaw rate, shape (2, 3)."""
+    sizes = np.broadcast_to(math.inf if term.limit is None else term.limit, 3)
+    return np.clip([-sizes, sizes], *_limits(term.clip))
 
 
 def _limits(clip: Any) -> Any:

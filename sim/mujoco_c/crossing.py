@@ -20,7 +20,7 @@ from kernels.rewards import Rewards
 from kernels.state import RobotStep
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all
-from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges
+from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, find_highest_command, make_start_ranges
 from sim.mujoco_c.model import (
     NO_SOFTNESS,
     Starts,
@@ -177,6 +177,7 @@ def cross_in_mujoco_c(
     rows = np.zeros((count, robot.observation_size))
     remembers = reset_all(policy, count)  # it must be asked for the same robots every time
     max_steps = round(robot.max_duration_s / robot.physics_dt)
+    highest = find_highest_command(CrossingCfg(), robot)
     for step in range(max_steps):
         if len(running := np.flatnonzero(outcome == Outcome.RUNNING)) == 0:
             break
@@ -186,7 +187,7 @@ def cross_in_mujoco_c(
             command[running] = goal_commands(qpos, robot.speed)
             if steering is not None:
                 steered = running[~np.isnan(steering[running, 0, 0])]
-                command[steered] = steered_commands(episodes.qpos[steered], steering[steered])
+                command[steered] = steered_commands(episodes.qpos[steered], steering[steered], highest)
             seen = (heights, qpos, episodes.qvel[running], command[running], last_action[running])
             row = observations(*seen, default_joint_pos=default, scan=scan)
             touches = 0.01 * np.linalg.norm(episodes.forces[running][:, feet], axis=2)

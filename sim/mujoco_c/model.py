@@ -6,6 +6,7 @@ quaternion is wxyz, the base's linear velocity that of its origin in the world f
 frame.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any
@@ -230,8 +231,11 @@ def goal_commands(qpos: Array, speed: float) -> Array:
     return np.stack([speed * np.cos(error), speed * np.sin(error), yaw_rate], axis=1)
 
 
-def steered_commands(qpos: Array, steering: NDArray[np.floating]) -> Array:
-    """Commands of robots that are steered, (num, 3), by ways of shape (num, SEGMENTS, 3): :data:`STEERING`."""
+def steered_commands(qpos: Array, steering: NDArray[np.floating], highest: Sequence[float]) -> Array:
+    """Commands of robots that are steered, (num, 3), by ways of shape (num, SEGMENTS, 3): :data:`STEERING`.
+
+    They are no larger than ``highest`` (:func:`sim.crossing.find_highest_command`).
+    """
     start, goal = np.array(CrossingCfg.start), np.array(CrossingCfg.goal)
     length = np.linalg.norm(goal - start)
     along = (goal - start) / length
@@ -244,7 +248,7 @@ def steered_commands(qpos: Array, steering: NDArray[np.floating]) -> Array:
     error = _wrap(np.arctan2(way[:, 1], way[:, 0]) - _heading(qpos))
     turn = CrossingCfg.yaw_gain * _wrap(error + heading)
     commands = np.stack([speed * np.cos(error), speed * np.sin(error), turn], axis=1)
-    return np.clip(commands, CrossingCfg.lowest_command, CrossingCfg.highest_command)
+    return np.clip(commands, CrossingCfg.lowest_command, highest)
 
 
 def distances_from_line(qpos: Array) -> Array:

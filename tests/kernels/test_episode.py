@@ -1,5 +1,7 @@
 """Episodes: their queue, start, command and end, by an oracle, properties and hand-computed numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -20,7 +22,7 @@ from kernels.penalties import BASE, FOOT, LIMB
 from kernels.queue import clear_rows, make_queue, make_ready, restart_episodes, turn_over
 from kernels.rewards import Rewards, make_rewards
 from kernels.state import RobotStep
-from sim.crossing import CrossingCfg, make_start_ranges, make_task
+from sim.crossing import CrossingCfg, find_highest_command, make_start_ranges, make_task
 from sim.mujoco_c.model import Starts, goal_commands, steered_commands
 from sim.robots.find import get_robot
 from tests.kernels import oracle
@@ -31,8 +33,8 @@ MAX_STEPS = 4000
 BASE_COM = (-0.02, 0.01, 0.03)
 
 
-def create_task(**settings):
-    return make_task(CrossingCfg(**settings), get_robot("anymal"))
+def create_task(speed=0.75, **settings):
+    return make_task(CrossingCfg(**settings), replace(get_robot("anymal"), speed=speed))
 
 
 def make_state(num_envs, outcome=0, steps=0):
@@ -188,21 +190,24 @@ def test_commands_lead_to_the_goal():
     np.testing.assert_allclose(commands(q, [0, 0, Outcome.TIME_OUT]), by_hand, atol=1e-5)
 
 
-def steered(q, steering, episode_of_env, outcome=0):
+def steered(q, steering, episode_of_env, outcome=0, **settings):
     out = wp.full((len(q), 3), 9.0, dtype=float)
     over = wp.array(np.broadcast_to(outcome, len(q)), dtype=int)
     ways = wp.array(np.float32(steering), dtype=float)
-    command_steered(wp.array(q), over, ways, wp.array(episode_of_env, dtype=int), create_task(), out)
+    command_steered(wp.array(q), over, ways, wp.array(episode_of_env, dtype=int), create_task(**settings), out)
     return out.numpy()
 
 
-def test_steered_commands_follow_the_way_of_the_episode():
+@pytest.mark.parametrize("speed", [0.75, 1.5])
+def test_steered_commands_follow_the_way_of_the_episode(speed):
     q, qd = random_states(300, 3)
     rng = np.random.default_rng(4)
-    ways = rng.normal([0.75, 0.0, 0.0], [0.5, 0.5, 0.5], (300, SEGMENTS, 3)).astype(np.float32)
+    ways = rng.normal([speed, 0.0, 0.0], [0.5, 0.5, 0.5], (300, SEGMENTS, 3)).astype(np.float32)
     order = rng.permutation(300)
-    expected = steered_commands(Starts.of_newton(q, qd, np.zeros(3)).qpos, ways[order])
-    np.testing.assert_allclose(steered(q, ways, order), expected, atol=2e-5)
+    highest = find_highest_command(CrossingCfg(), replace(get_robot("anymal"), speed=speed))
+    expected = steered_commands(Starts.of_newton(q, qd, np.zeros(3)).qpos, ways[order], highest)
+    np.testing.assert_allclose(steered(q, ways, order, speed=speed), expected, atol=2e-5)
+    assert expected[:, 0].max() == max(speed, 1.0)  # as fast as unsteered, or 1 m/s
 
 
 def test_steered_commands_by_hand():

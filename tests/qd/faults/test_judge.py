@@ -315,6 +315,25 @@ def test_ways_are_sought_where_no_controller_certifies_and_are_kept(path, monkey
     assert np.flatnonzero(other.walker != "").tolist() == rows[:1].tolist() and other.kind.sum() == 1
 
 
+def test_of_few_terrains_to_steer_on_one_a_family_comes_first(path, monkeypatch):
+    archive = judged(path)
+    rows = np.flatnonzero(archive.confirmed & ~archive.certified)
+    families = np.full(len(archive), 7)
+    families[rows[[3, 4]]] = 2
+    write_archive(path / "archive.npz", replace(archive, family=families))
+    for most, chosen in ((1, rows[:1]), (2, rows[[0, 3]]), (3, rows[[0, 1, 3]]), (None, rows)):
+        _, [(_, genes, _)] = witnessed(path, monkeypatch, most_steered=most)
+        assert np.array_equal(genes, archive.genes[chosen])
+
+
+def test_where_controllers_certify_all_nobody_is_steered(path, monkeypatch):
+    archive = judged(path)
+    with_goal_rates(path, np.where(archive.is_fault, 0.0, 1.0))
+    steered, asked = witnessed(path, monkeypatch, robots=Robots(cross_by_genes, stop_after=0))
+    assert not asked and not steered.witnesses.kind.any() and steered.is_fault.sum() == archive.is_fault.sum() > 0
+    assert numbers_in(path)["witnesses"]["tried"] == 0 and numbers_in(path)["faults"] == archive.is_fault.sum()
+
+
 def test_faults_by_ways_alone_are_not_crossed_by_certifiers_again(path, monkeypatch):
     archive, [(walkers, genes, _)] = witnessed(path, monkeypatch)  # before it was confirmed
     assert [*walkers] == ["searched"] and len(genes) == archive.failing.sum()

@@ -7,7 +7,7 @@ import pytest
 
 from kernels.episode import SEGMENTS, Outcome
 from qd.faults.numbers import describe_way
-from qd.faults.steer import SteerCfg, find_kinds, measure_line, score_ways, seek_witnesses
+from qd.faults.steer import SteerCfg, find_kinds, find_ways, measure_line, score_ways, seek_witnesses
 from sim.robots.find import get_robot
 from sim.terrains.terrains import Terrains
 from tests.qd.stand_in import result_of
@@ -20,7 +20,7 @@ class Planted:
 
     def __init__(self) -> None:
         self.robot = get_robot("anymal")
-        self.asked = []
+        self.asked, self.speeds = [], []
 
     def cross(self, policy, terrains, *, replicas, engine="search", label, invalid_ok, progress=None):
         self.asked.append((policy, engine, len(terrains), replicas, label, progress is not None))
@@ -28,6 +28,7 @@ class Planted:
         if steering is None:  # plain crossings of measure_line
             steering = np.full((len(terrains), replicas, SEGMENTS, 3), np.nan, np.float32)
         plain = np.isnan(steering[..., 0, 0])
+        self.speeds.append(steering[..., 0].max())
         speed, offset = steering[..., 5, 0], steering[..., 5, 1]  # at the obstacle
         luck = np.stack([np.random.default_rng(int(seed)).uniform(size=replicas) for seed in terrains.seeds])
         kind = terrains.genes[:, :1].astype(int) + np.zeros_like(luck, int)
@@ -81,6 +82,20 @@ def test_another_walker_tries_only_what_has_no_witness_on_the_line():
     assert witnesses.kind.tolist() == [3, 0, 1] and witnesses.walker.tolist() == ["searched"] * 3
     first = next(row for row in crosser.asked if row[0] == "strong")
     assert first[2] == 2 and first[4] == "C-G on the line"
+
+
+@pytest.mark.parametrize(("speed", "limit", "fastest"), [(1.5, 9.0, 1.5), (0.75, 9.0, 1.0), (0.75, 0.4, 0.4)])
+def test_a_robot_goes_as_fast_as_it_is_commanded_elsewhere_and_as_its_description_lets_it(
+    tmp_path, speed, limit, fastest
+):
+    file, crosser = tmp_path / "controller.toml", Planted()
+    file.write_text(
+        f'policy = "policy.pt"\naction_scale = 0.5\nobservation = [{{term = "command", limit = {limit}}}]\n'
+    )
+    crosser.robot = replace(crosser.robot, speed=speed)
+    seeds, how = np.arange(4)[None].astype(np.uint32), {"rng": np.random.default_rng(0), "label": ""}
+    find_ways(crosser, str(file), planted(WALL), seeds, limit_m=0.5, cfg=SteerCfg(generations=4), **how)
+    assert max(crosser.speeds) == pytest.approx(fastest)
 
 
 def counts_of(goals, plain=0, beside=None, resolved=None):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kernels.episode import Outcome
+from kernels.episode import SEGMENTS, Outcome
 from qd.workers import crosser as service
 from qd.workers.cache import Cache
 from qd.workers.compute import Compute
@@ -60,6 +60,18 @@ def test_work_that_was_stopped_goes_on_from_its_last_lot_in_other_lots_and_anoth
     result = cross_all(after, tmp_path, GENES[order], SEEDS[order])
     assert after.seeds == [8, 5, 7]
     assert_same(result, stand_in.evaluate(GENES[order], SEEDS[order], 20))
+
+
+def test_what_is_stopped_says_what_is_kept(tmp_path):
+    robots, said = Robots(stop_after=0), []
+    with Crosser(ROBOT, compute_by(robots, TWO_WORKERS), cache=tmp_path) as crosser:
+        for terrains in (TERRAINS, TERRAINS[4:], replace(TERRAINS, steering=np.zeros((9, 20, SEGMENTS, 3)))):
+            with pytest.raises(Interrupted) as stopped:
+                crosser.cross(POLICY, terrains, replicas=20)
+            said.append(str(stopped.value))
+            robots.stop_after = 2  # a lot, the first time
+    # Nothing was crossed; then a lot was; steered crossings are not kept, but that lot is.
+    assert said[0] == "Stopped." and "crossed is kept" in said[1] and "before this step is kept" in said[2]
 
 
 CHANGES = [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sim.controllers.described import Described, read_controller
+from sim.controllers.described import Described, read_controller, read_speed_limits
 from sim.controllers.loaders import load_policy, prepare_torch
 from sim.controllers.spec import ControllerSpec, controller_hash
 from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint
@@ -81,6 +81,21 @@ def test_terms_in_numbers(anymal, seen_by):
     ]  # fmt: skip
     np.testing.assert_allclose(seen[0, 0], expected, atol=1e-6)
     np.testing.assert_allclose(seen[1, 0, 9:11], [math.sin(math.pi / 2), math.cos(math.pi / 2)], atol=1e-6)  # 20 ms on
+
+
+@pytest.mark.parametrize(
+    ("terms", "limits"),
+    [
+        ('{term = "command", limit = [0.4, 9, 9], clip = [0.2, 0.8]}, {term = "gravity", clip = 0.1}', (0.2, 0.4)),
+        ('{term = "command", clip = [-0.5, 0.6]}, {term = "command", limit = 0.7, order = "v_x"}', (-0.5, 0.6)),
+        ('{term = "command", limit = 0.7, order = "yaw_rate"}', (-math.inf, math.inf)),
+    ],
+)
+def test_speeds_that_a_controller_is_told(tmp_path, terms, limits):
+    file = tmp_path / "controller.toml"
+    file.write_text(f'policy = "policy.pt"\naction_scale = 0.5\nobservation = [{terms}]\n')
+    assert read_speed_limits(str(file)) == limits
+    assert read_speed_limits("walk.py:act") == read_speed_limits("policy.pt") == (-math.inf, math.inf)
 
 
 @pytest.fixture
