@@ -159,13 +159,15 @@ def rsl_rl_actor(observations=OBSERVATIONS, actions=ACTIONS, normalised=False):
     """rsl_rl's own actor, with a normaliser that has seen something."""
     torch.manual_seed(0)
     rows = TensorDict({"policy": torch.randn(64, observations) * 3 + 1}, batch_size=64)
-    distribution = {"class_name": "GaussianDistribution", "init_std": 1.0}
-    actor = MLPModel(
-        rows, {"actor": ["policy"]}, "actor", actions, (32, 16), "elu", normalised, distribution_cfg=distribution
-    )
-    if normalised:
-        actor.train()
-        actor.obs_normalizer.update(rows["policy"])
+    noise = {"distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 1.0}}
+    actor = MLPModel(rows, {"actor": ["policy"]}, "actor", actions, (32, 16), "elu", normalised, **noise)
+    return seen(actor, rows) if normalised else actor.eval()
+
+
+def seen(actor, rows):
+    """An actor of rsl_rl whose normaliser has seen rows."""
+    actor.train()
+    actor.obs_normalizer.update(rows["policy"])
     return actor.eval()
 
 

@@ -20,14 +20,9 @@ _NO_PROSE = (r"^```.*?^```$", r"^\|.*?$", r"<!--.*?-->", r"`[^`\n]*`", r"\]\([^)
 _FUNCTIONS = {"__builtins__": {}, "len": len, "max": max, "min": min, "round": round, "sum": sum}
 """What an expression may call."""
 _KINDS = (
-    r"arXiv \d+\.\d+",
-    r"Python 3\.\d+",
-    "95 %",
-    r"Apache-2\.0",
-    r"exit status is \d+",
-    r"seed \d",
+    r"arXiv \d+\.\d+", r"Python 3\.\d+", "95 %", r"Apache-2\.0", r"exit status is \d+", r"seed \d",
     r"\d GB of disk",
-)
+)  # fmt: skip
 """Numbers that no file has: of papers and versions, the level of all intervals, exit statuses."""
 
 
@@ -59,9 +54,8 @@ def run_by_make(words: Sequence[str]) -> list[str]:
 
     ``make`` runs without the environment: one that runs the tests would hand on its own flags.
     """
-    done = subprocess.run(
-        [*words, "--dry-run"], env={"PATH": os.environ["PATH"]}, cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    how = {"env": {"PATH": os.environ["PATH"]}, "cwd": ROOT, "capture_output": True, "text": True, "check": True}
+    done = subprocess.run([*words, "--dry-run"], **how)
     return shlex.split(done.stdout.splitlines()[-1])
 
 
@@ -99,9 +93,8 @@ def numbers() -> list[Number]:
     for page, text, sources in ((page, *pair) for page, texts in pages.items() for pair in texts.items()):
         parts = [part.split(": ", 1) for part in sources.split(" | ")]
         expressions = [(source, expression) for source, several in parts for expression in several.split("; ")]
-        rows += [
-            Number(page, text, *row) for row in zip(_NUMBER.findall(text), *zip(*expressions, strict=True), strict=True)
-        ]
+        columns = (_NUMBER.findall(text), *zip(*expressions, strict=True))
+        rows += [Number(page, text, *row) for row in zip(*columns, strict=True)]
     return rows
 
 

@@ -20,15 +20,7 @@ from sim.files.intervals import format_value
 from sim.files.provenance import provenance
 from sim.robots.find import get_robot
 from tests.bench.cases import Case, build_scene, make_cases
-from tests.bench.ceiling import (
-    Ceiling,
-    Timing,
-    fit_launches,
-    measure_ceiling,
-    repeat_torch,
-    repeat_warp,
-    time_in_turns,
-)
+from tests.bench.ceiling import Ceiling, Timing, fit_launches, measure_ceiling, repeat_torch, repeat_warp, time_in_turns
 
 
 def measure_kernel(case: Case, ceiling: Ceiling, device: str, timing: Timing, *, compiled: bool) -> dict[str, Any]:
@@ -86,9 +78,8 @@ def main(argv: list[str]) -> None:
     if args.small:
         timing = Timing(rounds=1, replay_s=1e-6)
     prepare_torch(device)
-    scene = build_scene(
-        robot, device, num_envs=num_envs, num_terrains=num_terrains, walk_s=1.0 if args.small else 8.0, seed=0
-    )
+    sizes = {"num_envs": num_envs, "num_terrains": num_terrains, "walk_s": 1.0 if args.small else 8.0}
+    scene = build_scene(robot, device, **sizes, seed=0)
     ceiling = measure_ceiling(device, timing)
     cases = make_cases(scene).values()
     rows = [measure_kernel(case, ceiling, device, timing, compiled=not args.small) for case in cases]

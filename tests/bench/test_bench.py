@@ -44,9 +44,8 @@ def test_the_work_of_a_ceiling_is_done(device, link, step):
 
 
 # 1 TB/s from memory, 4 in a cache of 1 MB, 10 TFLOP/s, 1 T exponentials/s, 2 us a launch.
-CEILING = Ceiling(
-    copies={1 << 10: 1e9, 1 << 20: 4e12, 1 << 30: 1e12}, flops_per_s=1e13, specials_per_s=1e12, launch_s=2e-6
-)
+COPIES = {1 << 10: 1e9, 1 << 20: 4e12, 1 << 30: 1e12}
+CEILING = Ceiling(copies=COPIES, flops_per_s=1e13, specials_per_s=1e12, launch_s=2e-6)
 
 
 @pytest.mark.parametrize(

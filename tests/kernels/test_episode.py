@@ -245,9 +245,8 @@ class Robots:
     """Robots without physics: what a test says of their episodes is what happened."""
 
     def __init__(self, num_envs):
-        self.queue = make_queue(
-            num_envs, SLOTS, REPLICAS, 1, rewarded=False, steered=False, device=str(wp.get_device())
-        )
+        how = {"rewarded": False, "steered": False, "device": str(wp.get_device())}
+        self.queue = make_queue(num_envs, SLOTS, REPLICAS, 1, **how)
         self.episodes = make_episodes(num_envs)
         self.queue.seed.assign(np.arange(7, 7 + SLOTS, dtype=np.uint32))
         self.sums, self.terrain = wp.zeros((num_envs, 1)), wp.zeros(num_envs, dtype=int)

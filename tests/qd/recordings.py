@@ -84,10 +84,8 @@ def stand_in_cross(crossed: list):
 def rows(count: int) -> list[dict]:
     """Lines of a run's metrics."""
     always = {"terrains": 10, "episodes": 40, "invalid_episodes": 1, "wall_s": 2.5}
-    return [
-        {"iteration": k, "qd_score": 20.0 * k, "elites": 5 * k, "mean_fitness": 1.0 + k, **always}
-        for k in range(1, count + 1)
-    ]
+    steps = range(1, count + 1)
+    return [{"iteration": k, "qd_score": 20.0 * k, "elites": 5 * k, "mean_fitness": 1.0 + k, **always} for k in steps]
 
 
 def grouped_archive(sizes=(6, 9, 5)):

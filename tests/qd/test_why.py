@@ -73,9 +73,8 @@ def test_a_repair_is_among_the_changes_of_what_was_planted(dog):
 def test_robots_side_by_side_walk_as_each_does_alone(dog):
     base, weights = dog
     stiffer = replace(base, robot=replace(base.robot, stiffness=(120.0,) * 8, damping=(2.0,) * 8))
-    late, faster = (
-        replace(base, robot=replace(base.robot, **v)) for v in ({"drive_delay_steps": 3}, {"decimation": 2})
-    )
+    changes = ({"drive_delay_steps": 3}, {"decimation": 2})
+    late, faster = (replace(base, robot=replace(base.robot, **change)) for change in changes)
     timed = {"device": "cpu", "seconds": 1.5, "replicas": 2}
     variants = [replace(base, gains=(2.0, 1.0, 1.0)), late, base, faster]
     together = walk_variants(variants, weights, **timed)

@@ -180,11 +180,8 @@ def test_it_goes_on_without_the_first_controller_and_from_an_archive_that_moved(
 def test_archives_are_trained_on_together_but_for_what_any_of_them_holds_out(places):
     course = spaces.get_space("course")
     whole = make_archive(30, seed=1)
-    made = {
-        "same": whole,
-        "part": whole.rows(np.arange(20)),
-        "course": replace(make_archive(10), space="course", genes=course.hard_random(10, 3)),
-    }
+    of_courses = replace(make_archive(10), space="course", genes=course.hard_random(10, 3))
+    made = {"same": whole, "part": whole.rows(np.arange(20)), "course": of_courses}
     for name, archive in made.items():
         write_archive(places / f"{name}.npz", archive)
     elites = find_training_elites(ROBOT, cfg_of(places, archive=tuple(str(places / f"{name}.npz") for name in made)))
@@ -220,10 +217,8 @@ def test_which_elites_are_trained_on(places, searched):
     genes, archive = make_archive(10).genes, (str(searched),)
     train = set(hash_elites(genes[split_elites(make_archive(10)).train]))
     for only, count in (("all", 10), ("failing", 8)):
-        whole, held = (
-            find_training_elites(ROBOT, cfg_of(places, archive=archive, only=only, held_out=held_out)).genes[0]
-            for held_out in (False, True)
-        )
+        cfgs = [cfg_of(places, archive=archive, only=only, held_out=held_out) for held_out in (False, True)]
+        whole, held = (find_training_elites(ROBOT, cfg).genes[0] for cfg in cfgs)
         assert set(hash_elites(whole)) == set(hash_elites(genes[:count]))
         assert set(hash_elites(held)) == train & set(hash_elites(whole))
     elites = find_training_elites(ROBOT, cfg_of(places, archive=archive, only="failing"))
@@ -356,9 +351,8 @@ def test_it_learns_goes_on_and_crosses(dog, tmp_path, capsys):
         described = finetune(dog, dog_cfg(dog, iterations=iterations), run, on_cpu)
     assert f"written to {described} and" in capsys.readouterr().out
     assert described == run / "controller.toml" and read_checkpoint(run / "checkpoint.pt")["iter"] == 3
-    assert read_controller(described) == replace(
-        read_controller(dog.policy_file), policy="policy.pt", activation="swish"
-    )
+    before = read_controller(dog.policy_file)
+    assert read_controller(described) == replace(before, policy="policy.pt", activation="swish")
     assert controllers_in(tmp_path / "panel") == {"mine": str(tmp_path / "panel" / "mine.toml")}
     start, after, copy = (load_policy(path, dog, "cpu") for path in
                           (dog.policy_file, described, tmp_path / "panel" / "mine.toml"))  # fmt: skip

@@ -182,10 +182,8 @@ def test_the_choice_is_by_terrains_that_are_neither_reported_nor_trained_on(hard
     assert set(hash_elites(seen["search-0"].terrains.genes)) == set(hash_elites(archive.genes[validation]))
     reported = make_sets(("hand_crafted", "hard_random"), 3, 0)
     assert not any(np.array_equal(seen[name].terrains.values, reported[name].terrains.values) for name in reported)
-    tested, trained = (
-        hash_elites(generated_set(archive, 3, 0).terrains.genes),
-        read_trained_on(f"{place}/run/tune-1/policy.pt"),
-    )
+    tested = hash_elites(generated_set(archive, 3, 0).terrains.genes)
+    trained = read_trained_on(f"{place}/run/tune-1/policy.pt")
     assert trained and not {*tested, *trained} & set(hash_elites(seen["search-0"].terrains.genes))
     assert not set(tested) & trained
 

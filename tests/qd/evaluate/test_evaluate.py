@@ -9,22 +9,9 @@ import pytest
 
 from qd.commands import EvaluateCommand
 from qd.evaluate import evaluate as evaluation
+from qd.evaluate import pack as packs
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
-from qd.evaluate.pack import (
-    HEIGHT_UNIT_M,
-    add_rates,
-    choose_terrains,
-    count_failing,
-    evaluate_pack,
-    find_pack,
-    make_pack,
-    passes,
-    read_pack,
-    round_heights,
-    summarise_rates,
-    write_terrains,
-)
 from qd.evaluate.sets import split_elites
 from qd.evaluate.tables import is_regression
 from qd.faults.judge import judge
@@ -178,7 +165,7 @@ def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=
 )
 def test_what_comes_next(candidates, expected):
     for size in (9, 1):  # each beginning of a pack is one
-        assert choose_terrains(candidates, size) == expected[:size]
+        assert packs.choose_terrains(candidates, size) == expected[:size]
 
 
 def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypatch):
@@ -186,7 +173,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     robots, base = Robots(fails), {"base": str(anymal.policy_file)}
 
     def make(controllers, **changes):
-        return make_pack(find_search(path), controllers, compute=compute_by(robots), out=Path("pack"), **changes)
+        return packs.make_pack(find_search(path), controllers, compute=compute_by(robots), out=Path("pack"), **changes)
 
     compute = compute_by(Robots(bump_stops))
     judge(path, stages=("resolved",), compute=compute)
@@ -225,51 +212,52 @@ def pack(tmp_path, anymal, monkeypatch):
     heights[2, :, 150:] = 0.5
     Path("pack").mkdir()
     chosen = [candidate(3), candidate(7, fault=False), candidate(9, family=1, cause="drop")]
-    entries = add_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
+    entries = packs.add_rates(chosen, {"base": result_of([[HIT] * 4, [GOAL] * 4, [GOAL, GOAL, GOAL, HIT]])})
     genes = np.array([np.full(64, entry["elite"] / 100) for entry in chosen], np.float32)
     content = controller_identity(anymal, anymal.policy_file) | {"seed": 0, "episodes": 4, "searched": "base"}
-    content |= {"terrains": entries, "rates": {"base": summarise_rates(entries, "base", 0)}}
-    content["terrains_sha256"] = write_terrains(Path("pack"), round_heights(heights), genes)
+    content |= {"terrains": entries, "rates": {"base": packs.summarise_rates(entries, "base", 0)}}
+    content["terrains_sha256"] = packs.write_terrains(Path("pack"), packs.round_heights(heights), genes)
     Path("pack/pack.json").write_text(json.dumps(content))
     return heights
 
 
 def test_a_pack_is_read_as_it_was_written(pack):
-    stored = read_pack(find_pack("pack"))
+    stored = packs.read_pack(packs.find_pack("pack"))
     assert len(stored.terrains) == 3 and stored.terrains[1]["verdict"] == "near-fault"
-    np.testing.assert_array_equal(stored.heights, round_heights(pack))
-    assert np.abs(stored.heights - pack).max() <= HEIGHT_UNIT_M / 2 + 1e-6
+    np.testing.assert_array_equal(stored.heights, packs.round_heights(pack))
+    assert np.abs(stored.heights - pack).max() <= packs.HEIGHT_UNIT_M / 2 + 1e-6
     assert stored.genes[:, 0].tolist() == pytest.approx([0.03, 0.07, 0.09])
-    assert find_pack("anymal") == ROBOTS["anymal"].pack and len(read_pack(find_pack("cassie")).terrains) == 100
+    assert packs.find_pack("anymal") == ROBOTS["anymal"].pack
+    assert len(packs.read_pack(packs.find_pack("cassie")).terrains) == 100
     with pytest.raises(FileNotFoundError, match="dog"):
-        find_pack("dog")
+        packs.find_pack("dog")
 
 
 @pytest.mark.parametrize("damage", ["npz", "other", "key"])
 def test_a_damaged_pack_is_refused(pack, damage):
     file, content = Path("pack/pack.npz"), json.loads(Path("pack/pack.json").read_text())
     if damage == "other":  # of another making
-        write_terrains(Path("pack"), round_heights(pack[::-1]), np.zeros((3, 64), np.float32))
+        packs.write_terrains(Path("pack"), packs.round_heights(pack[::-1]), np.zeros((3, 64), np.float32))
     elif damage == "key":
         del content["rates"]
         Path("pack/pack.json").write_text(json.dumps(content))
     else:
         file.write_bytes(file.read_bytes()[:-9])
     with pytest.raises(ValueError, match="pack"):
-        read_pack(Path("pack"))
+        packs.read_pack(Path("pack"))
 
 
 def test_rates_over_a_pack_are_means_with_families_drawn_together():
     chosen = [candidate(elite, family=family) for elite, family in enumerate((0, 0, 1))]
-    entries = add_rates(chosen, {"this": result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]])})
-    rates = summarise_rates(entries, "this", 0)
+    entries = packs.add_rates(chosen, {"this": result_of([[GOAL] * 4, [GOAL] * 4, [HIT, HIT, LATE, LATE]])})
+    rates = packs.summarise_rates(entries, "this", 0)
     assert rates["goal_rate"] == pytest.approx(2 / 3) and rates["success_rate"] == pytest.approx((1 + 1 + 0.5) / 3)
     assert (rates["failing"], rates["terrains"], rates["failing_families"], rates["families"]) == (1, 3, 1, 2)
     assert rates["goal_interval"] == [0.0, 1.0]  # two families: a quarter of the resamples each has one alone
-    assert count_failing(entries, "this", "cause") == {"ridge": {"terrains": 3, "failing": 1}}
+    assert packs.count_failing(entries, "this", "cause") == {"ridge": {"terrains": 3, "failing": 1}}
     # An invalid terrain is in no rate.
-    entries = add_rates(chosen, {"this": result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4])})
-    rates = summarise_rates(entries, "this", 0)
+    entries = packs.add_rates(chosen, {"this": result_of([[GOAL] * 4, [BAD] * 4, [HIT] * 4])})
+    rates = packs.summarise_rates(entries, "this", 0)
     assert entries[1]["rates"]["this"]["goal_rate"] is None
     assert (rates["goal_rate"], rates["terrains"], rates["failing"]) == (0.5, 2, 1)
 
@@ -277,8 +265,8 @@ def test_rates_over_a_pack_are_means_with_families_drawn_together():
 def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     robots = Robots(fails)
     sizes = {"compute": compute_by(robots), "episodes": 2}
-    stored = read_pack(Path("pack"))
-    report = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **sizes)
+    stored = packs.read_pack(Path("pack"))
+    report = packs.evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **sizes)
     (file,) = Path("runs").glob("anymal-*-pack.json")
     assert json.loads(file.read_text()) == json.loads(json.dumps(report))
     # It fails the first terrain, which is 4 m high, and crosses the flat one.
@@ -289,7 +277,7 @@ def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     shown = capsys.readouterr().out
     assert "1 of 2" in shown and "ridge" in shown
     assert not robots.opened[0].reward and robots.opened[0].engine == "search"
-    whole = evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **sizes)
+    whole = packs.evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **sizes)
     assert whole["rates"]["terrains"] == 3
 
 
@@ -300,4 +288,4 @@ def test_ci_fails_where_the_goal_rate_may_be_lower(pack, capsys, least, status):
         assert run_command(EvaluateCommand, flags, name="evaluate") == status
     # All of two families: Wilson's interval begins at 2 / (2 + 1.96^2) = .342.
     assert "0.342" in (out := capsys.readouterr().out) and f"{least:.3f}" in out
-    assert not passes({"rates": {"goal_interval": None}}, 0.1)  # one family says nothing of its spread
+    assert not packs.passes({"rates": {"goal_interval": None}}, 0.1)  # one family says nothing of its spread

@@ -33,9 +33,8 @@ def robots(x, *, time_s=20.0, goals=20):
         result = stand_in.evaluate(heights, seeds, cfg.replicas)
         outcome = np.where(np.arange(cfg.replicas) < goals, Outcome.GOAL, Outcome.TIME_OUT).astype(np.uint8)
         end = np.broadcast_to(np.array([x, 4.0, 0.3], np.float32), result.final_position.shape).copy()
-        return replace(
-            result, final_position=end, outcome=outcome[None], duration_s=np.full_like(result.duration_s, time_s)
-        )
+        time = np.full_like(result.duration_s, time_s)
+        return replace(result, final_position=end, outcome=outcome[None], duration_s=time)
 
     return Robots(rule)
 

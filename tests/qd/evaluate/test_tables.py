@@ -1,5 +1,6 @@
 """What crossings say of controllers on each terrain, the tables of it, and the sets of terrains that they are on."""
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -33,9 +34,8 @@ from tests.qd.searches import CFG
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, OUT, result_of
 from tests.train.conftest import write_actor, write_trained
 
-ABOUT = {
-    who: {"policy": f"{who}.pt", "sha256": 64 * sha256} for who, sha256 in (("base", "f"), ("C-G", "a"), ("S", "b"))
-}
+HASHES = {"base": 64 * "f", "C-G": 64 * "a", "S": 64 * "b"}
+ABOUT = {who: {"policy": f"{who}.pt", "sha256": digest} for who, digest in HASHES.items()}
 SET = replace(make_set(5), numbers=np.array([10, 3, 7, 5, 8]))
 
 
@@ -301,12 +301,8 @@ def test_a_split_follows_from_the_elites_alone():
 
 def test_sets_have_random_numbers_of_their_own():
     names = ("hand_crafted", "hard_random", "flat", "generated", "generated_independent", "pack", "dose")
-    draws = [
-        set_rng(name, seed, part).integers(2**63)
-        for name in names
-        for seed in (0, 1)
-        for part in ("test", "validation")
-    ]
+    ways = itertools.product(names, (0, 1), ("test", "validation"))
+    draws = [set_rng(*way).integers(2**63) for way in ways]
     draws += [np.random.default_rng(seed).integers(2**63) for seed in range(3)]
     assert len(set(draws)) == 31
 

@@ -10,15 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from qd.faults.judge import (
-    InMujocoC,
-    count_outcomes,
-    draw_faults,
-    elite_seeds,
-    fresh_values,
-    is_decided,
-    judge,
-)
+from qd.faults.judge import InMujocoC, count_outcomes, draw_faults, elite_seeds, fresh_values, is_decided, judge
 from qd.search.archive import no_witnesses, read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
@@ -80,17 +72,12 @@ def test_outcomes_are_counted_by_hand():
     assert count_outcomes(result).tolist() == [[1, 2, 4, 3]]
 
 
-GENES = {
-    ("searched", False): (9, 2.0),
-    ("searched", True): (9, 0.3),
-    ("C-G", False): (10, -0.2),
-    ("C-G", True): (11, -0.4),
-}
-"""The gene by which all robots arrive, and above which value, by controller and whether contact is resolved."""
+GENES = {"searched": ((9, 2.0), (9, 0.3)), "C-G": ((10, -0.2), (11, -0.4))}
+"""The gene by which all robots arrive, and above which value, by controller, as searched and with contact resolved."""
 
 
 def crosses(policy, resolved, genes):
-    gene, above = GENES["C-G" if "C-G" in policy else "searched", resolved]
+    gene, above = GENES["C-G" if "C-G" in policy else "searched"][resolved]
     return genes[:, gene] > above
 
 
@@ -190,9 +177,8 @@ def test_a_fault_is_robust_if_it_is_one_under_the_same_20_varied_conditions_too(
     archive.varied.searched[rows[-1]] = [10, 10, 0, 0]  # it crosses half of them: so it does not fail
     assert not archive.robust[rows[-1]]
     assert {cfg.space for cfg, *_ in crossed} == {VARIED_SPACE.name}
-    by_policy = [
-        [row for cfg, genes, _ in crossed if cfg.policy == name for row in genes] for name in (SHIPPED, *OTHER.values())
-    ]
+    by = (SHIPPED, *OTHER.values())
+    by_policy = [[row for cfg, genes, _ in crossed if cfg.policy == name for row in genes] for name in by]
     assert np.array_equal(*map(np.array, by_policy))
     starts = np.concatenate([seeds for *_, seeds in crossed])
     assert len(np.unique(by_policy[0], axis=0)) == len({*starts.tolist()}) == 20 * len(rows)

@@ -66,9 +66,8 @@ def test_families_of_elites_of_failing_ones_and_of_faults():
 def all_faults(fresh_rates, resolved, coarse, fine):
     """Faults that one certifier crosses: episodes of 20 that reach the goal."""
     archive = small_archive(len(fresh_rates))
-    counts = [
-        np.stack([goals, 20 - goals, 0 * goals, 0 * goals], axis=1) for goals in map(np.array, (resolved, coarse, fine))
-    ]
+    goals = np.array([resolved, coarse, fine])
+    counts = np.stack([goals, 20 - goals, 0 * goals, 0 * goals], axis=2)
     return replace(
         archive, fresh=replace(fresh_values(archive), goal_rate=np.array(fresh_rates)), resolved_outcomes=counts[0],
         certifiers=("C-G",), certifier_sha256=("a" * 64,), certifier_outcomes=counts[1][:, None],
@@ -98,9 +97,8 @@ def test_significant_are_those_of_the_worse_physics_whose_share_of_luck_is_held(
     coarse, fine = np.zeros((2, 5, 2, 4), np.int64)
     coarse[:, 0] = fine[:, 0] = always
     coarse[3, 1], fine[3, 1] = (6, 0, 0, 0), (0, 6, 0, 0)  # p of 1 / 84 at the search's settings alone
-    archive = replace(
-        archive, resolved_outcomes=np.array(never), certifier_outcomes=coarse, certifier_resolved_outcomes=fine
-    )
+    outcomes = {"certifier_outcomes": coarse, "certifier_resolved_outcomes": fine}
+    archive = replace(archive, resolved_outcomes=np.array(never), **outcomes)
     # 2 / 924, 2 / 252 and 2 / 70 = .029 are under .05 times 1, 2 and 3 of 4; 2 / 20 is over .05.
     assert find_significant(archive).tolist() == [True, True, True, False, False]
     assert pick_numbers(archive, "faults_panel", "faults_fdr") == (4, 3)

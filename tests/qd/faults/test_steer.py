@@ -53,11 +53,9 @@ def planted(*kinds):
 
 def seek(kinds, walkers, limit_m=0.5):
     cfg, crosser = SteerCfg(), Planted()
-    shape = (len(kinds), cfg.seeds * len(walkers))
+    shape, rng = (len(kinds), cfg.seeds * len(walkers)), np.random.default_rng(2)
     seeds = np.random.default_rng(1).integers(2**32, size=shape, dtype=np.uint32)
-    return crosser, seek_witnesses(
-        crosser, walkers, planted(*kinds), seeds, limit_m, rng=np.random.default_rng(2), cfg=cfg
-    )
+    return crosser, seek_witnesses(crosser, walkers, planted(*kinds), seeds, limit_m, rng=rng, cfg=cfg)
 
 
 def test_planted_terrains_get_the_right_word():

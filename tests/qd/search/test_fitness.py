@@ -145,11 +145,10 @@ def test_terrain_ratio_is_the_mean_of_the_valid_episodes_ratios():
 def test_reachable_are_the_boxes_with_a_strictly_inner_point_on_the_plane(num_ratios, intervals):
     # Exact oracle: walk from the lower to the upper corner of a box; the sum grows linearly, so the plane sum = 1 is
     # crossed strictly inside exactly if the walk's parameter lies strictly between 0 and 1.
-    expected = [
-        box
-        for box in product(range(intervals), repeat=num_ratios)
-        if 0 < (1 - Fraction(sum(box), intervals)) / Fraction(num_ratios, intervals) < 1
-    ]
+    def crosses(box):
+        return 0 < (1 - Fraction(sum(box), intervals)) / Fraction(num_ratios, intervals) < 1
+
+    expected = [*filter(crosses, product(range(intervals), repeat=num_ratios))]
     assert [tuple(row) for row in Cells(num_ratios, intervals).tuples.tolist()] == expected
 
 

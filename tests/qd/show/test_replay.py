@@ -124,10 +124,8 @@ def test_invalid_episodes_are_left_out_of_the_rates():
     ends = [Outcome.BASE_COLLISION, Outcome.GOAL, Outcome.INVALID]
     sums = np.repeat([[1.0], [3.0], [np.nan]], 6, axis=1)
     made = recording_of(ends, [4.0, 14.0, 3.0], penalties=sums, fallen=[False, False, True])
-    made = dataclasses.replace(
-        made, duration_s=np.array([[4.0, 16.0, 1.0]]), invalidity=np.array([[0, 0, Invalidity.SPEED]], np.uint8)
-    )
-    numbers = compute_numbers(made)
+    times, invalidity = np.array([[4.0, 16.0, 1.0]]), np.array([[0, 0, Invalidity.SPEED]], np.uint8)
+    numbers = compute_numbers(dataclasses.replace(made, duration_s=times, invalidity=invalidity))
     assert {name: rate["hits"] for name, rate in numbers["rates"].items()} == {"success": 1, "goal": 1, "fallen": 0}
     assert numbers["penalties"]["vel_x"] == {"mean": 2.0, "std": 1.0, "unit": "(m/s)^2 s"}  # of 1 and 3
     assert numbers["duration_s"] == 10.0  # of 4 and 16
@@ -225,9 +223,8 @@ def test_minimal_terrains_are_replayed_exported_and_listed_in_the_viewer(tmp_pat
 
     def record(recordings, asked):
         wanted.extend(asked)
-        return [
-            dataclasses.replace(recording_of([Outcome.GOAL, Outcome.TIME_OUT], [14.0, 6.0]), genes=genes[number][None])
-        ]
+        made = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [14.0, 6.0])
+        return [dataclasses.replace(made, genes=genes[number][None])]
 
     monkeypatch.setattr(Recordings, "record", record)
     source = source_from_run(opened_run, minimal=str(number), replicas=2, seed=3, policy="shipped")

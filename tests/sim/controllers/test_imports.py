@@ -233,10 +233,8 @@ def leapp(folder, kp="gains", **changes):
     kinds = {"quat_w": "state/body/rotation", "joint_pos": "state/joint/position", "past": None,
              "targets": "target/joint/position", "past_out": None, "kp": "kp", "kd": "kd"}  # fmt: skip
     names = {"quat_w": [list("xyzw")]}
-    items = [
-        {"name": name, "kind": kind, "element_names": names.get(name, [RIGHT_FIRST]), "is_state": kind is None}
-        for name, kind in kinds.items()
-    ]
+    about = {name: {"kind": kind, "is_state": kind is None} for name, kind in kinds.items()}
+    items = [{"name": name, "element_names": names.get(name, [RIGHT_FIRST]), **of} for name, of in about.items()]
     digest = hashlib.sha256((folder / "policy.onnx").read_bytes()).hexdigest()
     parameters = {"model_path": "policy.onnx", "sha256sum": digest}
     model = {"inputs": items[:3], "outputs": items[3:], "parameters": parameters} | changes
@@ -432,9 +430,8 @@ def test_a_run_of_isaac_lab_3_is_read(tmp_path):
     env, agent = source / "params" / "env.yaml", source / "params" / "agent.yaml"
     text = env.read_text().replace("effort_limit_sim: 30.0", "joint_effort_limit: 30.0")
     text = text.replace("sim: {", "sim: {physics: {class_type: 'isaaclab_newton.physics:NewtonManager'}, ")
-    text = text.replace("clip: null}\n", "clip: {.*_hip: [0.1, 1.1]}}\n").replace(
-        "    height_scan:", "  scan:\n    height_scan:"
-    )
+    text = text.replace("clip: null}\n", "clip: {.*_hip: [0.1, 1.1]}}\n")
+    text = text.replace("    height_scan:", "  scan:\n    height_scan:")
     env.write_text(text)
     agent.write_text("{clip_actions: 5.0, obs_groups: {actor: [scan, policy], critic: [policy]}}")
     robot, controller = imported(source, tmp_path)

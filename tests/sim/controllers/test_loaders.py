@@ -17,7 +17,7 @@ from sim.controllers.formats.rsl_rl import MlpPolicy
 from sim.controllers.loaders import load_policy, prepare_torch
 from sim.controllers.runner import Memory, PolicyRunner, find_memory
 from sim.controllers.spec import ControllerSpec, controller_hash, describe_controllers, label_suffix, parse_controllers
-from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint
+from tests.builders import ACTIONS, OBSERVATIONS, rows_of, rsl_rl_actor, save_checkpoint, seen
 
 ADAPTER = "def adapt(actor, robot): "
 STATE = rsl_rl_actor().state_dict()
@@ -45,10 +45,7 @@ def recurrent_actor(width, *, rnn_type="lstm", layers=1, normalised=False):
     rows = TensorDict({"policy": rows_of(64)[:, :width]}, batch_size=64)
     options = {"rnn_type": rnn_type, "rnn_hidden_dim": 8, "rnn_num_layers": layers}
     actor = RNNModel(rows, {"actor": ["policy"]}, "actor", ACTIONS, (16,), "elu", normalised, **options)
-    if normalised:
-        actor.train()
-        actor.obs_normalizer.update(rows["policy"])
-    return actor.eval()
+    return seen(actor, rows) if normalised else actor.eval()
 
 
 def rename(state, names):

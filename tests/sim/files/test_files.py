@@ -16,14 +16,7 @@ from scipy.special import ndtr, stdtrit
 
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.files.figures import as_png, new_figure
-from sim.files.intervals import (
-    DIFFERENCES,
-    RATES,
-    bootstrap_interval,
-    format_rate,
-    format_value,
-    wilson_interval,
-)
+from sim.files.intervals import DIFFERENCES, RATES, bootstrap_interval, format_rate, format_value, wilson_interval
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
 from sim.files.provenance import code_fingerprint, provenance
 from sim.files.settings import Interval, NonNegativeFloat, PositiveInt, Share, check_settings, from_builtins, problems

@@ -68,9 +68,8 @@ def test_values_of_a_robot_toml_may_be_of_all_joints_or_by_their_names(tmp_path)
     text = 'stiffness = 50\ndamping = {".*_hip" = 2, ".*_knee" = 3, HR_knee = 4}\nspeed = 0.5\n'
     text += 'saturation_effort = 40\nvelocity_limit = {".*_hip" = 20, ".*_knee" = 15}\n'
     file = write_toml(tmp_path / "dog", f"{text}default_joint_pos = {{'.*hip' = 0.6, '.*knee' = -1.2}}")
-    (file.parent / "controller.toml").write_text(
-        'observation = [{term = "contacts"}, {term = "scan", x = [0.0, 0.2], y = [0]}, {term = "rpy", axes = "yaw"}]'
-    )
+    terms = '{term = "contacts"}, {term = "scan", x = [0.0, 0.2], y = [0]}, {term = "rpy", axes = "yaw"}'
+    (file.parent / "controller.toml").write_text(f"observation = [{terms}]")
     dog = get_robot(str(file))
     assert (dog.stiffness, dog.damping, dog.default_joint_pos) == ((50,) * 8, (2, 3) * 3 + (2, 4), (0.6, -1.2) * 4)
     assert (dog.saturation_effort, dog.velocity_limit) == ((40,) * 8, (20, 15) * 4)

@@ -15,13 +15,7 @@ from sim.robots.find import get_robot
 from sim.robots.training import NoiseCfg
 from sim.rollout import Rollout
 from sim.terrains.bank import make_terrains
-from sim.terrains.conditions.kinds import (
-    CONDITIONS,
-    condition_column,
-    condition_genes,
-    nominal_row,
-    round_steps,
-)
+from sim.terrains.conditions.kinds import CONDITIONS, condition_column, condition_genes, nominal_row, round_steps
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.registry import get_space, load_space, space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -81,10 +75,9 @@ def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, shar
         shared.control_step()
     ours = shared.sim.joint_q.numpy()[order]
     starts = draw_starts(anymal, heights, 1000, EPISODES, "cpu")
-    plain, nominal = (
-        cross_and_keep(anymal, anymal.policy_file, heights, starts, seconds, ground=under(row))[0].qpos
-        for row in (conditions, nominal_row())
-    )
+    grounds = map(under, (conditions, nominal_row()))
+    crossed = [cross_and_keep(anymal, anymal.policy_file, heights, starts, seconds, ground=at) for at in grounds]
+    plain, nominal = (episodes.qpos for episodes, *_ in crossed)
     np.testing.assert_allclose(ours[:, :3], plain[:, :3], atol=1e-3)
     np.testing.assert_allclose(ours[:, 7:], plain[:, 7:], atol=0.02)
     columns = [0, 1, 2, *range(7, ours.shape[1])]

@@ -222,9 +222,8 @@ def test_an_npy_is_what_terrain_generators_hold(rough):
 
 def test_a_mesh_is_a_closed_block_with_the_simulations_surface_on_top(rough):
     small = rough[:9, :13]
-    mesh = trimesh.load(
-        io.BytesIO(encode_terrain(ExportedTerrain(heights=small), "stl")), file_type="stl", force="mesh"
-    )
+    stl = io.BytesIO(encode_terrain(ExportedTerrain(heights=small), "stl"))
+    mesh = trimesh.load(stl, file_type="stl", force="mesh")
     assert mesh.is_watertight and mesh.is_winding_consistent
     # The volume between the terrain and the bottom, half a metre below its lowest point.
     cells = [small[:-1, :-1], small[:-1, 1:], small[1:, :-1], small[1:, 1:]]

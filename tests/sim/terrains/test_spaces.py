@@ -87,15 +87,10 @@ def test_a_lower_space_is_the_same_terrain_with_all_heights_scaled(name):
 
 
 def test_a_course_in_words():
-    genes = course(
-        element("kerb", size=0.15, turn=1),
-        element("stairs", size=0.18, length=0.28, detail=3, turn=-1),
-        element("ditch", size=0.4, length=6),
-    )[0]
-    assert COURSE.describe(genes) == (
-        "kerb 0.15 m up, 3 stairs of 0.18 x 0.28 m down, ditch 0.30 m wide and 0.40 m deep"
-    )
-    assert COURSE.parts(genes)[0] == "kerb 0.15 m up"
+    kerb, stairs = element("kerb", size=0.15, turn=1), element("stairs", size=0.18, length=0.28, detail=3, turn=-1)
+    genes = course(kerb, stairs, element("ditch", size=0.4, length=6))[0]
+    words = "kerb 0.15 m up, 3 stairs of 0.18 x 0.28 m down, ditch 0.30 m wide and 0.40 m deep"
+    assert COURSE.describe(genes) == words and COURSE.parts(genes)[0] == "kerb 0.15 m up"
     assert len(COURSE.parts(genes)) == 6 and COURSE.parts(genes)[3] == "nothing"
 
 

@@ -166,9 +166,8 @@ GRAVITY = 9.81
 def uniform(friction=(1.0,), tau=(0.0,)):
     """Maps of one friction and time constant a terrain."""
     shape = np.ones((max(len(friction), len(tau)), 4, 8), np.float32)
-    return GroundMaps(
-        friction=shape * np.float32(friction)[:, None, None], time_constant_s=shape * np.float32(tau)[:, None, None]
-    )
+    friction, tau = (shape * np.float32(values)[:, None, None] for values in (friction, tau))
+    return GroundMaps(friction=friction, time_constant_s=tau)
 
 
 def height_in_mujoco_c(robot, ground, z, duration_s):

@@ -8,10 +8,8 @@ from tests.qd.show.view import browser
 from tests.qd.show.view.browser import LIMIT_MS, PLAYS, open_chromium, said, serve, wait_for, wait_until
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(browser.BROWSER is None, reason="there is no browser: apt-get install chromium"),
-]
+REASON = "there is no browser: apt-get install chromium"
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.BROWSER is None, reason=REASON)]
 
 
 @pytest.fixture(scope="module")
