@@ -387,7 +387,8 @@ class InMujocoC(OfFaults):
         searched[rows] = cross(search.policy, rows, "searched")
         failing = rows[goal_rates(searched[rows]) < FAILING_GOAL_RATE]
         asked = np.zeros_like(archive.certificates)
-        asked[failing] = [[name == best_certifier(archive, row) for name in archive.certifiers] for row in failing]
+        for row in failing.tolist():
+            asked[row] = [name == best_certifier(archive, row) for name in archive.certifiers]
         certifiers = self._cross_by_certifiers(archive, judging, asked, cross)
         steered = np.zeros_like(searched)
         if (witnesses := archive.witnesses) is not None:

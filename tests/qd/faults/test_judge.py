@@ -257,7 +257,11 @@ def test_a_fault_holds_in_mujoco_c_if_the_controller_fails_and_its_best_certifie
 
 
 def test_mujoco_c_crosses_faults_alone_and_no_soft_ground(path):
-    judged(path, certifiers={"S": WEAK})  # which crosses nothing
+    judged(path)
+    nobody_fails = Robots(lambda cfg, genes, seeds: np.zeros(len(genes), bool))
+    archive = judged(path, nobody_fails, stages=("mujoco_c",))
+    assert not archive.holds_in_mujoco_c.any() and not archive.mujoco_c.certifiers.any()
+    write_archive(path / "archive.npz", replace(archive, certifier_outcomes=0 * archive.certifier_outcomes))
     with pytest.raises(ValueError, match=r"stages .* no faults"):
         judged(path, Robots(cross_by_genes, stop_after=0), stages=("mujoco_c",))
     soft = SimpleNamespace(search=SimpleNamespace(space=get_space("super_gaussian+softness")))
