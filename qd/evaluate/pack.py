@@ -330,7 +330,7 @@ def _read_judged(search: Search) -> Archive:
     if archive.fresh is None or (archive.failing & ~crossed).any():
         rule = "must have its failing elites crossed with contact resolved and by other controllers"
         got = f"{(archive.failing & crossed).sum()} of {archive.failing.sum()}"
-        raise ValueError(f"{search.run} {rule}, got {got}: run `faultline judge` on it first")
+        raise ValueError(f"{search.run} {rule}, got {got}: run `faultline judge` on it first, with --certifiers")
     return archive
 
 
@@ -368,7 +368,7 @@ def find_candidates(archive: Archive, search: Search) -> tuple[list[tuple[Entry,
             numbers = {"searched": rate_numbers(fresh_counts(archive, number)), **judgement(archive, number)}
             add(number, None, archive.genes[number], VERDICTS[verdicts[number]], **numbers)
         else:
-            not_passable += 1
+            not_passable += not archive.certified[number]  # steered, a robot may cross it
     for minimal in minima.numbers["elites"] if minima else ():
         number = minimal["elite"]
         if not archive.failing[number] or len(minimal["bumps"]) == minimal["of"]:

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -284,12 +285,11 @@ class OfFaults(Stage):
     def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
         """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
         hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
-        certify = np.asarray(archive.certificates[archive.is_fault].any(axis=0), np.bool_)
+        certify = {*compress(archive.certifiers, np.any(archive.certificates[archive.is_fault], axis=0).tolist())}
         if archive.witnesses is not None:
-            walkers = archive.witnesses.walker[archive.is_fault & ~archive.certified_by_controllers]
-            certify[np.isin(np.array(archive.certifiers, np.str_), walkers)] = True
-        stored = zip(archive.certifiers, archive.certifier_sha256, certify, strict=True)
-        names = [name for name, digest, certifies in stored if certifies and hashes.get(name) != digest]
+            certify |= {*archive.witnesses.walker[archive.is_fault & ~archive.certified_by_controllers].tolist()}
+        stored = dict(zip(archive.certifiers, archive.certifier_sha256, strict=True))
+        names = [name for name in sorted(certify - {SEARCHED}) if hashes.get(name) != stored.get(name, "")]
         if lost := [name for name in names if not (renewed and name in hashes)]:
             rule = f"certifiers must be those that certify faults of {judging.search.run}"
             remedy = "give the files by --certifiers, or other controllers of these names and the stage others, too"

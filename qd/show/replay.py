@@ -12,6 +12,7 @@ import numpy as np
 from kernels.episode import Outcome
 from kernels.penalties import PENALTIES
 from qd.faults.numbers import SEARCHED, describe_judgement
+from qd.faults.searches import CERTIFIERS_FOLDER
 from qd.search.descriptors import Cells
 from qd.search.directory import RUNS, output_folder
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
@@ -90,9 +91,8 @@ class ReplaySource:
             searched = run.policy() if self.by else terrain.request.policy
             policy = searched if walker == SEARCHED else run.certifiers().get(walker)
             if policy is None:
-                raise ValueError(
-                    f"{WITNESS} of {terrain.request.label} needs the controller {walker}, got no file of it"
-                )
+                what = f"{WITNESS} of {terrain.request.label} needs the controller {walker}, got no file of it"
+                raise ValueError(f"{what}: put it into {CERTIFIERS_FOLDER}/ of the run")
             ways = np.tile(witnesses.way[elite.number], (1, terrain.request.replicas, 1, 1))
             steered = replace(terrain.request.terrain, steering=ways)
             requests.append(replace(terrain.request, terrain=steered, policy=policy))

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ from sim.controllers.spec import controller_identity
 from sim.files.command import run_command
 from sim.robots.robot import ROBOTS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
-from tests.builders import make_archive
+from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.builders import judged_archive, make_archive, steered_archive
 from tests.qd.robots import OTHER, Robots, bump_stops
 from tests.qd.searches import crossing_by
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, PENALTIES, compute_by, result_of
@@ -201,6 +203,13 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
     assert [entry["name"] for entry in few["terrains"]] == [entry["name"] for entry in content["terrains"][:3]]
     assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
+
+
+def test_what_a_steered_robot_crosses_is_no_candidate_and_passable(anymal, tmp_path):
+    search = SimpleNamespace(space=SUPER_GAUSSIAN, run=tmp_path, robot=anymal)
+    for archive, not_passable in ((judged_archive(), 2), (steered_archive(), 1)):  # elites 1 and 3; 1 on the line
+        candidates, count = packs.find_candidates(archive, search)
+        assert [entry["elite"] for entry, _ in candidates] == [0, 2, 4] and count == not_passable
 
 
 @pytest.fixture

@@ -346,6 +346,10 @@ def test_mujoco_c_steers_where_a_way_certifies(path, monkeypatch):
     write_archive(path / "archive.npz", replace(held, certifier_outcomes=0 * held.certifier_outcomes))
     with pytest.raises(ValueError, match=r"certifiers .*C-G"):
         judged(path, Robots(cross_by_genes, stop_after=0), stages=("mujoco_c",), certifiers={})
+    nobody = np.where(held.witnesses.walker == "C-G", "nobody", held.witnesses.walker)  # a damaged archive
+    write_archive(path / "archive.npz", replace(held, witnesses=replace(held.witnesses, walker=nobody)))
+    with pytest.raises(ValueError, match=r"certifiers .*nobody"):
+        judged(path, Robots(cross_by_genes, stop_after=0), stages=("mujoco_c",))
     again, _ = witnessed(path, monkeypatch, (3, 0), speed=0.5)
     assert again.mujoco_c is None and "faults_mujoco_c" not in numbers_in(path)
 
