@@ -215,7 +215,6 @@ def measure_scales(result: RolloutResult) -> dict[str, Any]:
     by_failing = int(failing.sum()) >= _ENOUGH
     rows = np.asarray(result.penalties, np.float64)[failing if by_failing else valid]
     means = dict(zip(result.penalty_names, rows.mean(axis=0).tolist(), strict=True))
-    shares = (rows > 0.0).mean(axis=0).tolist()
     return {
         "terrains": len(valid),
         "episodes": int(valid.size),
@@ -223,5 +222,5 @@ def measure_scales(result: RolloutResult) -> dict[str, Any]:
         "failing_episodes": int(failing.sum()),
         "scaled_by": "failing" if by_failing else "all",
         "scales": {name: mean for name, mean in means.items() if mean},
-        "share_of_episodes_with": dict(zip(result.penalty_names, shares, strict=True)),
+        "share_of_episodes_with": dict(zip(result.penalty_names, (rows > 0.0).mean(axis=0).tolist(), strict=True)),
     }

@@ -408,5 +408,4 @@ class DoseCommand(RobotFlag, WorkerFlags):
         controllers = parse_controllers(self.policies, robot)
         doses = parse_doses(self.elements, self.at)
         size: dict[str, Any] = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
-        compute = _compute(self)
-        measure_dose(robot, controllers, doses, compute=compute, resolved=self.resolved, out=self.out, **size)
+        measure_dose(robot, controllers, doses, compute=_compute(self), resolved=self.resolved, out=self.out, **size)

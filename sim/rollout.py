@@ -190,10 +190,9 @@ class Rollout:
             failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
             if not failed and not str(error).startswith("Failed to allocate"):
                 raise
-            raise ValueError(
-                f"num_envs and num_terrains must fit the memory that {device} has free, got {self.num_envs:,} robots "
-                f"and {num_terrains:,} terrains at once: give fewer"
-            ) from error
+            rule = f"num_envs and num_terrains must fit the memory that {device} has free"
+            got = f"{self.num_envs:,} robots and {num_terrains:,} terrains at once"
+            raise ValueError(f"{rule}, got {got}: give fewer") from error
 
     def _build(self, bank: TerrainBank, policy: Policy, solver: SolverCfg | None, *, steered: bool) -> None:
         from sim.simulation import Reward, Simulation  # Newton takes seconds to load: only what simulates loads it
@@ -387,8 +386,7 @@ class Rollout:
             self._advance()
         result = self._collect(lot)
         self._lots.popleft()
-        going = any(self._num_ended(other) < other.num_episodes for other in self._lots)
-        if going and not self._num_unreleased:
+        if any(self._num_ended(other) < other.num_episodes for other in self._lots) and not self._num_unreleased:
             self._advance()
         return result
 

@@ -116,10 +116,8 @@ class Simulation:
         if added_base_mass is not None:
             mass = model.body_mass.numpy()
             if not (mass[::bodies] + added_base_mass > 0.0).all():
-                raise ValueError(
-                    f"added_base_mass must leave some of the base's {mass[0]:g} kg, got {added_base_mass.min():g} kg: "
-                    "narrow its range in the robot's training settings"
-                )
+                rule = f"added_base_mass must leave some of the base's {mass[0]:g} kg, got {added_base_mass.min():g} kg"
+                raise ValueError(f"{rule}: narrow its range in the robot's training settings")
             mass[::bodies] += added_base_mass
             model.body_mass.assign(mass)
             model.body_inv_mass.assign(1.0 / mass)
@@ -243,15 +241,12 @@ class Simulation:
         if self.bank.conditions is None:
             return
         if isinstance(self.dynamics, StockDynamics):
-            raise ValueError(
-                f"robot '{self.robot.name}' cannot have conditions, since its model takes mujoco_warp's own step "
-                "(sim/solver.py says why): leave conditions out"
-            )
+            reason = "its model takes mujoco_warp's own step (sim/solver.py says why): leave conditions out"
+            raise ValueError(f"robot '{self.robot.name}' cannot have conditions, since {reason}")
         assert self.bank.ground is not None
         robot = self.robot
         drives = {"drive_delay": robot.drive_delay_steps, "delay_steps": self._delay.steps}
-        friction = self.bank.ground.factor
-        self._varied = self.dynamics.vary_bases(**drives, friction=friction, physics_dt=robot.physics_dt)
+        self._varied = self.dynamics.vary_bases(**drives, friction=self.bank.ground.factor, physics_dt=robot.physics_dt)
         observed = (self.num_envs, robot.observation_size)
         rows = (self.num_envs, self.bank.conditions.shape[1])
         former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)

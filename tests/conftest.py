@@ -129,5 +129,4 @@ def published(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def eight(robot, device):
     """Eight robots, each on a grid of its own; a test puts ground and robots where it wants them."""
-    bank = TerrainBank(8, device=device)
-    return Simulation(robot, bank, np.arange(8))
+    return Simulation(robot, TerrainBank(8, device=device), np.arange(8))

@@ -55,8 +55,7 @@ def run_by_make(words: Sequence[str]) -> list[str]:
     ``make`` runs without the environment: one that runs the tests would hand on its own flags.
     """
     how = {"env": {"PATH": os.environ["PATH"]}, "cwd": ROOT, "capture_output": True, "text": True, "check": True}
-    done = subprocess.run([*words, "--dry-run"], **how)
-    return shlex.split(done.stdout.splitlines()[-1])
+    return shlex.split(subprocess.run([*words, "--dry-run"], **how).stdout.splitlines()[-1])
 
 
 def prose_of(page: str) -> str:

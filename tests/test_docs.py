@@ -84,8 +84,7 @@ def test_the_description_of_the_page_is_read(tmp_path, anymal):
     described = Described(read_controller(tmp_path / "controller.toml"), robot, "it")
     # Five steps of four terms of three columns, three of six joints and a clock; one of six points.
     assert (described.observation_size, described.num_actions) == (5 * (4 * 3 + 3 * 6 + 2) + 6, 6)
-    terms = re.findall(r"^\| `(\w+)` \| [1-4a]", text_of("docs/controllers.md"), re.MULTILINE)
-    assert terms == [*TERMS]
+    assert re.findall(r"^\| `(\w+)` \| [1-4a]", text_of("docs/controllers.md"), re.MULTILINE) == [*TERMS]
 
 
 def test_the_map_of_the_page(tmp_path, monkeypatch):

@@ -174,10 +174,9 @@ class TrainCfg:
         if not self.ppo.hidden_dims:
             raise ValueError("ppo.hidden_dims must name at least one layer, got none")
         if self.ppo.mini_batches > self.num_envs * self.ppo.steps_per_env // 2:
-            raise ValueError(
-                f"ppo.mini_batches must be at most half of the {self.num_envs} x {self.ppo.steps_per_env} transitions "
-                f"of an iteration, got {self.ppo.mini_batches}: give fewer, or more num_envs"
-            )
+            transitions = f"{self.num_envs} x {self.ppo.steps_per_env} transitions of an iteration"
+            got = f"{self.ppo.mini_batches}: give fewer, or more num_envs"
+            raise ValueError(f"ppo.mini_batches must be at most half of the {transitions}, got {got}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -139,8 +139,7 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
         names = ", ".join(map(str, paths))
         raise ValueError(f"{names} must have elites to train on that are {cfg.recipe.only}, got none")
     spaces = tuple(map(read_space, archives))
-    goal_rate = np.concatenate(goal_rates)
-    return TrainingElites(genes=tuple(genes), spaces=spaces, goal_rate=goal_rate, archives=records)
+    return TrainingElites(genes=tuple(genes), spaces=spaces, goal_rate=np.concatenate(goal_rates), archives=records)
 
 
 def first_facts(robot: RobotCfg, cfg: FinetuneCfg, elites: TrainingElites, start: Start) -> dict[str, Any]:

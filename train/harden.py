@@ -145,10 +145,8 @@ class _Hardening:
         runs = [self.path / row["search"] for row in self.rows]
         counts = [len(read_archive(run)) for run in runs]
         if counts[0] < MIN_ELITES:
-            raise ValueError(
-                f"{runs[0]} must have found at least {MIN_ELITES} elites to train on, got {counts[0]}: give more "
-                "--search.episodes and another directory"
-            )
+            rule = f"{runs[0]} must have found at least {MIN_ELITES} elites to train on, got {counts[0]}"
+            raise ValueError(f"{rule}: give more --search.episodes and another directory")
         return [run for run, count in zip(runs, counts, strict=True) if count >= MIN_ELITES]
 
     def train(self, number: int) -> None:
@@ -202,16 +200,9 @@ class _Hardening:
         counts = RunDirectory(run).read_summary()
         identity = controller_identity(self.robot, policy)
         tuned = f"tune-{number}" if number else None
-        self.rows.append(
-            {
-                "controller": name,
-                **{key: identity[key] for key in ("policy", "policy_sha256")},
-                "tuned": tuned,
-                "kept": tuned and self.choices[tuned]["kept"],
-                "search": run.name,
-                **{key: counts.get(key) for key in _COUNTS},
-            }
-        )
+        row = {"controller": name, **{key: identity[key] for key in ("policy", "policy_sha256")}}
+        row |= {"tuned": tuned, "kept": tuned and self.choices[tuned]["kept"], "search": run.name}
+        self.rows.append(row | {key: counts.get(key) for key in _COUNTS})
 
     def search_cfg(self, number: int, policy: str | None) -> SearchCfg:
         """The search of a round against a controller, the robot's own if None."""

@@ -105,12 +105,11 @@ def measure(result: RolloutResult, scales: Sequence[float]) -> Performance:
     if result.reward is None:
         raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")
     counted = counted_episodes(result.invalid)
-    names = zip(result.penalty_names, scales, strict=True)
     return Performance(
         values={**terrain_rates(result), "reward": terrain_means(result.reward, counted)},
         penalties={
             name: terrain_means(result.penalties[..., column] / scale, counted)
-            for column, (name, scale) in enumerate(names)
+            for column, (name, scale) in enumerate(zip(result.penalty_names, scales, strict=True))
         },
         goals=(result.reached_goal & counted).sum(axis=1),
         episodes=counted.sum(axis=1),

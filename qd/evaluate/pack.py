@@ -129,8 +129,7 @@ def round_heights(heights: NDArray[np.floating]) -> NDArray[np.float32]:
 def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
     """The first ``count`` terrains of a pack; ``seed`` draws their episodes."""
     seeds = draw_seeds(set_rng("pack", seed), len(heights))
-    terrains = Terrains(heights=heights[:count], seeds=seeds[:count])
-    return TerrainSet(terrains=terrains, numbers=np.arange(count))
+    return TerrainSet(terrains=Terrains(heights=heights[:count], seeds=seeds[:count]), numbers=np.arange(count))
 
 
 def evaluate_pack(

@@ -22,6 +22,7 @@ from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
 from qd.faults.families import find_families, rms_distances
 from qd.search.archive import Archive
 from qd.search.directory import read_robot_archive, search_seed
+from qd.search.fitness import Table
 from sim.controllers.formats.rsl_rl import read_weights
 from sim.controllers.spec import ControllerSpec
 from sim.files.atomic import read_json
@@ -62,7 +63,7 @@ class EliteSplit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TerrainSet:
+class TerrainSet(Table):
     """T terrains to cross, and what is known of each."""
 
     terrains: Terrains
@@ -87,12 +88,6 @@ class TerrainSet:
     def certified(self) -> NDArray[np.bool_] | None:
         """Whether another controller crosses each elite that the searched one fails, shape (T,); None if unknown."""
         return self.elites.certified_by_controllers if self.elites is not None and self.elites.certifiers else None
-
-    def rows(self, chosen: NDArray[np.int64]) -> "TerrainSet":
-        """Some of the terrains alone."""
-        values = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray | Terrains)}
-        chosen_values: dict[str, Any] = {name: value[chosen] for name, value in values.items()}
-        return replace(self, **chosen_values, elites=self.elites and self.elites.rows(chosen))
 
 
 def paper_terrains(robot: str) -> int:
@@ -133,8 +128,7 @@ def _sort_by_genes(archive: Archive) -> NDArray[np.int64]:
 
 def elites_sha256(archive: Archive) -> str:
     """Hash of an archive's genes, whatever their order."""
-    genes = archive.genes[_sort_by_genes(archive)]
-    return hashlib.sha256(np.ascontiguousarray(genes).tobytes()).hexdigest()
+    return hashlib.sha256(np.ascontiguousarray(archive.genes[_sort_by_genes(archive)]).tobytes()).hexdigest()
 
 
 def read_independent(path: Path, archive_path: Path | None, robot: RobotCfg, space: str | None = None) -> Archive:
@@ -218,9 +212,8 @@ def nearest_distance(
 
     Genes have shape (T, num_genes) and (N, num_genes). Computed on the CPU, so that it is the same everywhere.
     """
-    maps, training_maps = (
-        make_heights(rows, space).reshape(len(rows), -1).astype(np.float64) for rows in (genes, training_genes)
-    )
+    banks = (make_heights(rows, space) for rows in (genes, training_genes))
+    maps, training_maps = (bank.reshape(len(bank), -1).astype(np.float64) for bank in banks)
     banks = (training_maps[first : first + _BANK] for first in range(0, len(training_maps), _BANK))
     return np.min([rms_distances(maps, bank).min(axis=1) for bank in banks], axis=0)
 

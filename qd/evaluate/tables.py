@@ -149,13 +149,10 @@ def _count_certified(
         roles: dict[str | None, str] = {elites.policy_sha256: "searched"}
         roles |= {hashes[certifier]: "certifier" for certifier, count in certifiers.items() if count}
         roles.pop(None, None)
-        certified[name] = {
-            "terrains": int(elites.certified_by_controllers.sum()),
-            "certifiers": certifiers,
-            "chosen_by": {
-                name: roles[about["sha256"]] for name, about in controllers.items() if about["sha256"] in roles
-            },
-        }
+        known = {name: about["sha256"] for name, about in controllers.items() if about["sha256"] in roles}
+        chosen_by = {name: roles[digest] for name, digest in known.items()}
+        terrains_certified = int(elites.certified_by_controllers.sum())
+        certified[name] = {"terrains": terrains_certified, "certifiers": certifiers, "chosen_by": chosen_by}
     return certified
 
 

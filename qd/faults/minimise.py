@@ -345,8 +345,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
     descriptions = space.parts(archive.genes[number])
     genes = [cut_genes(archive.genes[number], Trial(case.minimal, scale), space) for scale in (1.0, case.scale or 1.0)]
     effects = find_effects(genes[0], case.minimal, space)
-    half_width = search.robot.half_width
-    shapes = {part: effects.shape(index, half_width) for index, part in enumerate(case.minimal)}
+    shapes = {part: effects.shape(index, search.robot.half_width) for index, part in enumerate(case.minimal)}
     cause = case.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
     whole, scaled = make_heights(np.array(genes), space)
     without = {str(part): rate_numbers(counts) for part, counts in case.without.items()}

@@ -328,7 +328,5 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
     rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]
     if not rows:
         return None
-    return MinimalTerrains(
-        numbers=numbers | {"elites": [entries[row] for row in rows]},
-        genes={entries[row]["elite"]: genes[row] for row in rows},
-    )
+    genes_by_elite = {entries[row]["elite"]: genes[row] for row in rows}
+    return MinimalTerrains(numbers=numbers | {"elites": [entries[row] for row in rows]}, genes=genes_by_elite)

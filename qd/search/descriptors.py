@@ -107,8 +107,7 @@ class Cells:
         """Whether cells agree in their collision bits, and in their intervals up to 1, by their indices (batch,)."""
         bit_a, tuple_a = np.divmod(np.asarray(first), len(self.tuples))
         bit_b, tuple_b = np.divmod(np.asarray(second), len(self.tuples))
-        close = (np.abs(self.tuples[tuple_a] - self.tuples[tuple_b]) <= 1).all(axis=1)
-        return close & (bit_a == bit_b)
+        return (np.abs(self.tuples[tuple_a] - self.tuples[tuple_b]) <= 1).all(axis=1) & (bit_a == bit_b)
 
     def describe(self, cell: int) -> str:
         """A cell as text, for example ``0-0.1 0.3-0.4 0.5-0.6 with collision``."""

@@ -12,6 +12,7 @@ from qd.search.descriptors import Cells, terrain_ratios
 from sim.files.settings import PositiveFloat, check_settings
 from sim.rates import MAX_INVALID_SHARE, typical_outcome
 from sim.rollout import RolloutResult
+from sim.terrains.terrains import Terrains
 
 FITNESS_FLOOR = -20.0
 """Fitness of an invalid terrain; an elite's is above it, so that every elite adds to the QD score."""
@@ -52,13 +53,13 @@ class FitnessCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Columns of equally many rows; a value of a table may be a table of further columns."""
+    """Columns of equally many rows: arrays, terrains, and tables of further columns."""
 
     def rows(self, chosen: NDArray[Any]) -> Self:
         """Some of the rows alone, in the order given; arrays are copied."""
-        columns: dict[str, Any] = {name: v[chosen] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
-        tables = {name: table.rows(chosen) for name, table in vars(self).items() if isinstance(table, Table)}
-        return replace(self, **columns, **tables)
+        columns = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray | Terrains)}
+        tables: dict[str, Any] = {name: v.rows(chosen) for name, v in vars(self).items() if isinstance(v, Table)}
+        return replace(self, **{name: column[chosen] for name, column in columns.items()}, **tables)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -109,8 +109,7 @@ def read_finished(run: RunDirectory, cfg: SearchCfg, until: float | None) -> Arc
 
 def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None:
     """Writes archive, figures and numbers of a search, and prints what it found."""
-    config = run.read_config()
-    origin = {name: value for name, value in config.items() if name not in ("settings", "iterations")}
+    origin = {name: value for name, value in run.read_config().items() if name not in ("settings", "iterations")}
     run.write_derived(metrics, archive)
     figures = write_figures(run.path, archive, metrics)
     numbers = {

@@ -103,10 +103,8 @@ class OpenedRun:
         policy = resolve_policy(SHIPPED, self.robot)
         searched = self.archive.policy_sha256
         if searched not in (None, digest := controller_hash(policy)):
-            raise ValueError(
-                f"{self.path} was searched with another controller than {policy} (expected SHA-256 {searched}, got "
-                f"{digest}): say with --policy which one to cross with"
-            )
+            differs = f"another controller than {policy} (expected SHA-256 {searched}, got {digest})"
+            raise ValueError(f"{self.path} was searched with {differs}: say with --policy which one to cross with")
         return policy
 
     def suffix(self, policy: str) -> str:
@@ -149,10 +147,9 @@ class OpenedRun:
             genes = self.minima.genes
             numbers = choose_elites(minimal, [*self.minima.genes], f"{self.path} has no minimal terrain of elite")
             entries = {number: self.minima.entry(number) for number in numbers}
-        causes = self.rank(numbers=numbers).causes
         return [
             EliteTerrain(number, genes[number], "" if cause == UNCLEAR else cause, entries[number])
-            for number, cause in zip(numbers, causes, strict=True)
+            for number, cause in zip(numbers, self.rank(numbers=numbers).causes, strict=True)
         ]
 
 

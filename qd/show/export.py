@@ -35,10 +35,8 @@ def export_elites(
     archive = opened_run.archive
     space = opened_run.space
     if space.conditions:
-        raise ValueError(
-            f"a terrain file holds heights and ground, got terrains of {archive.space}, which are crossed under "
-            "conditions: replay or film them instead"
-        )
+        got = f"terrains of {archive.space}, which are crossed under conditions: replay or film them instead"
+        raise ValueError(f"a terrain file holds heights and ground, got {got}")
     terrains = opened_run.terrains(elite, minimal)
     ranking = opened_run.rank(numbers=[terrain.number for terrain in terrains])
 

@@ -309,8 +309,6 @@ def find_ghost(source: ReplaySource, name: str, device: str) -> str:
                 train = command_line("finetune", robot=robot.spec, specialist=run.path)
                 remedy = f"; the run has no specialist: `{train}` trains one, and {judge}"
         reason = f"got '{name}'" if remedy else str(error)
-        raise ValueError(
-            f"beside must be {', '.join([*known, SHIPPED])}, {WITNESS}, or a controller as --policy takes it: "
-            f"{reason}{remedy}"
-        ) from error
+        rule = f"beside must be {', '.join([*known, SHIPPED])}, {WITNESS}, or a controller as --policy takes it"
+        raise ValueError(f"{rule}: {reason}{remedy}") from error
     return policy

@@ -208,7 +208,6 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
     outcomes = {o.name.lower(): int((outcome == o).sum()) for o in Outcome if 0 < o < Outcome.TILT}
     fallen = int(recording.fallen[0, valid].sum())
     hits = {"success": count - outcomes["base_collision"], "goal": outcomes["goal"], "fallen": fallen}
-    sums = recording.result().penalties[0, valid]
     return {
         "episodes": recording.num_episodes,
         "invalid_episodes": recording.num_episodes - count,
@@ -221,7 +220,7 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
         "duration_s": float(recording.duration_s[0, valid].mean()),
         "penalties": {
             name: {"mean": float(column.mean()), "std": float(column.std()), "unit": PENALTIES[name].unit}
-            for name, column in zip(recording.penalty_names, sums.T, strict=True)
+            for name, column in zip(recording.penalty_names, recording.result().penalties[0, valid].T, strict=True)
         },
     }
 

@@ -210,8 +210,7 @@ def standing_rates(rollout: Rollout) -> dict[str, float] | None:
             for _ in range(robot.decimation):
                 mujoco_warp.step(on_device, data)
 
-        graph = sim.capture(control_step)
-        launch = partial(wp.capture_launch, graph)
+        launch = partial(wp.capture_launch, sim.capture(control_step))
         seconds_of(lambda: [launch() for _ in range(SETTLE)], device)
         seconds = seconds_of(lambda: [launch() for _ in range(STANDING)], device)
         theirs = data.qpos.numpy()[:, 2].mean()

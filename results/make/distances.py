@@ -32,12 +32,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     count = 5 if script.small else paper_terrains(script.robot.name)
     names = ("hard_random", "generated", "generated_far", "generated_independent")
     sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=read_space(archive))
-    nearest = {
-        name: nearest_distance(terrains.terrains.values, trained_on, read_space(archive))
-        for name, terrains in sets.items()
-    }
     rows = {}
-    for name, distances in nearest.items():
+    for name, terrains in sets.items():
+        distances = nearest_distance(terrains.terrains.values, trained_on, read_space(archive))
         least, median, largest = np.quantile(distances, (0.0, 0.5, 1.0)).tolist()
         rows[name] = {"terrains": len(distances), "median": median, "least": least, "largest": largest}
     counted = {}

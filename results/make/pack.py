@@ -19,8 +19,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not script.small:
         judge(run, stages=("resolved", "others"), compute=script.compute)
     sizes = {"size": size, "episodes": episodes, "seed": script.seed}
-    controllers = published_controllers(script)
-    make_pack(find_search(run), controllers, compute=script.compute, out=script.out.parent, **sizes)
+    make_pack(find_search(run), published_controllers(script), compute=script.compute, out=script.out.parent, **sizes)
 
 
 if __name__ == "__main__":

@@ -33,8 +33,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     dose = script.read_dose(conditions=False)
     numbers = {}
     for name in SPACES:
-        cfg = script.search_cfg(13, seed=script.seed, space=name)
-        _, numbers[name] = search_space(script, f"spaces/{name}", cfg)
+        _, numbers[name] = search_space(script, f"spaces/{name}", script.search_cfg(13, seed=script.seed, space=name))
     return script.write({"spaces": numbers, "dose": dose})
 
 

@@ -126,8 +126,7 @@ def time_crossings(
     genes = drawn.hard_random(num_terrains, seed)
     compute, policy = Compute(device, workers="1", num_envs=num_envs), str(robot.policy_file)
     sizes: Any = {"num_terrains": max(1, num_terrains * 4 // each), "replicas": REPLICAS}
-    cfg = PipelineCfg(compute=compute, robot=robot, policy=policy, space=space, **sizes)
-    with open_pipeline(cfg) as evaluate:
+    with open_pipeline(PipelineCfg(compute=compute, robot=robot, policy=policy, space=space, **sizes)) as evaluate:
         result = evaluate(Terrains(genes=genes, seeds=np.arange(num_terrains, dtype=np.uint32), space=drawn))
     rate = result.outcome.size / result.wall_s
     return {"num_envs": num_envs, "episodes_per_s": rate, "idle_share": result.idle_share}

@@ -208,8 +208,7 @@ def cross_in_mujoco_c(
         steps[running] += 1
         deviation[running] = np.maximum(deviation[running], distances_from_line(episodes.qpos[running]))
         state = (episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running])
-        penalties = step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
-        sums[running] += robot.physics_dt * penalties
+        sums[running] += robot.physics_dt * step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
     sums[outcome == Outcome.INVALID] = np.nan
     upright = 1.0 - 2.0 * (episodes.qpos[:, 4] ** 2 + episodes.qpos[:, 5] ** 2)
     return RolloutResult(

@@ -167,10 +167,9 @@ def _lay_ground(model: Any, robot: RobotCfg, friction: Array, time_constant: Arr
     of_robot = (model.geom_contype != 0) & (model.geom_bodyid > 0)
     for name in ("friction", "solref", "solimp"):
         if np.ptp(getattr(model, f"geom_{name}")[of_robot], axis=0).any():
-            raise ValueError(
-                f"robot '{robot.name}': plain MuJoCo needs one {name} of all its geoms on ground with friction or "
-                "softness of its own, got several: leave +friction and +softness out"
-            )
+            rule = f"needs one {name} of all its geoms on ground with friction or softness of its own"
+            remedy = "leave +friction and +softness out"
+            raise ValueError(f"robot '{robot.name}': plain MuJoCo {rule}, got several: {remedy}")
     first = int(np.flatnonzero(of_robot)[0])
     model.geom_friction[geoms] = model.geom_friction[first]
     model.geom_friction[geoms, 0] = max(model.geom_friction[first, 0], GROUND_FRICTION) * friction

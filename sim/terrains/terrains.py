@@ -35,10 +35,8 @@ class GroundMaps:
         check_map("friction", self.friction)
         check_map("softness", self.time_constant_s)
         if len(self.friction) != len(self.time_constant_s):
-            raise ValueError(
-                f"maps must be of as many terrains, got {len(self.friction)} of friction and "
-                f"{len(self.time_constant_s)} of softness"
-            )
+            got = f"{len(self.friction)} of friction and {len(self.time_constant_s)} of softness"
+            raise ValueError(f"maps must be of as many terrains, got {got}")
         genes = condition_genes()
         if self.rows.shape != (len(self), len(genes)):
             raise ValueError(f"conditions must have shape ({len(self)}, {len(genes)}), got {self.rows.shape}")

@@ -36,8 +36,7 @@ def random_states(num_envs, num_joints, seed=0, speed=2.0):
     joint_q[:, :3] = rng.uniform([0, 0, 0.2], [16, 8, 1.0], (num_envs, 3))
     quaternion = rng.normal(size=(num_envs, 4))
     joint_q[:, 3:7] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
-    joint_qd = rng.uniform(-speed, speed, (num_envs, 6 + num_joints))
-    return np.float32(joint_q), np.float32(joint_qd)
+    return np.float32(joint_q), np.float32(rng.uniform(-speed, speed, (num_envs, 6 + num_joints)))
 
 
 def upright(num_envs, num_joints, x=2.0, y=4.0, z=0.6):

@@ -59,8 +59,7 @@ def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundl
     radius = np.array([radius for _, radius in strips])[records["shape"]][:, None]
     # The point lies half way between the surfaces.
     centre = records["point"] + (half + radius) * records["normal"]
-    turns = oracle.rotation_matrix(pose[:, 3:])
-    records["centre"] = np.einsum("nji,nj->ni", turns, centre - pose[:, :3])
+    records["centre"] = np.einsum("nji,nj->ni", oracle.rotation_matrix(pose[:, 3:]), centre - pose[:, :3])
     records["touched"] = records["point"] - half * records["normal"]
     return records | {"count": count, "env": env, "buffer": buffer}
 
@@ -180,8 +179,7 @@ def test_a_state_that_is_not_finite_touches_nothing_nor_does_a_parked_robot():
     strip, flat = [(np.zeros(3), 0.1)], np.zeros((1, 161, 321))
     low = np.tile([5, 4, 0.05, 0, 0, 0, 1], (2, 1))
     for parked in range(3):
-        found = collide(low, np.zeros(2, int), flat, strip, parked=parked)
-        assert found["count"].tolist() == [int(parked < 2)] * 2
+        assert collide(low, np.zeros(2, int), flat, strip, parked=parked)["count"].tolist() == [int(parked < 2)] * 2
     assert not collide(np.full((2, 7), np.nan), np.zeros(2, int), flat, strip)["count"].any()
 
 

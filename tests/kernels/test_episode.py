@@ -116,8 +116,7 @@ def test_an_invalid_episode_says_why_and_a_cause_goes_before_what_comes_of_it():
     action[5] = q[5, 0] = qd[5, 0] = qd[6, 0] = np.nan
     overflow[5] = overflow[6] = 4
     state = make_state(8)
-    outcomes = latch((q, qd), state, action=action, overflow=overflow)
-    assert outcomes == [Outcome.INVALID] * 7 + [Outcome.RUNNING]
+    assert latch((q, qd), state, action=action, overflow=overflow) == [Outcome.INVALID] * 7 + [Outcome.RUNNING]
     expected = ["ACTION", "OVERFLOW", "STATE", "SPEED", "STATE", "ACTION", "OVERFLOW"]
     assert [Invalidity(k).name for k in state.invalidity.numpy()[:7]] == expected
     # An episode that ends otherwise has no reason, whatever the one before it had.
@@ -285,8 +284,7 @@ def test_rows_are_taken_round_the_ring():
     robots = Robots(5)
     for lot in range(7):  # five at a time of twelve rows: 0-4, 5-9, 10-2, 3-7, ...
         make_ready(5, robots.queue)
-        rows = robots.turn()
-        assert sorted(rows) == sorted((5 * lot + k) % 12 for k in range(5))
+        assert sorted(robots.turn()) == sorted((5 * lot + k) % 12 for k in range(5))
         robots.end(range(5))
     robots.turn()
     # 35 episodes on 3 terrains of 4: rows 0 to 10 were run three times, row 11 twice.

@@ -15,8 +15,7 @@ BASE_COM = (-0.02, 0.01, 0.03)
 
 def make_sensors(num_joints, scan):
     x, y = np.reshape(scan, (-1, 2)).T
-    default = np.linspace(-0.5, 0.5, num_joints)
-    return filled(Sensors, default_joint_pos=default, scan_x=x, scan_y=y)
+    return filled(Sensors, default_joint_pos=np.linspace(-0.5, 0.5, num_joints), scan_x=x, scan_y=y)
 
 
 def observe(states, command, last_action, terrain_of_env, grids, scan):

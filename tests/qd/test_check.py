@@ -135,8 +135,7 @@ def test_terrains_are_added_until_200_episodes_failed_and_a_stop_loses_nothing(s
     assert (content["failing_episodes"], content["scaled_by"]) == (200, "failing")
     genes = SUPER_GAUSSIAN.hard_random(40, 0)
     whole = failing(0.25)(stand_in.evaluate(genes, np.random.SeedSequence(0).generate_state(40, np.uint32), 20))
-    means = whole.penalties[~whole.reached_goal].mean(axis=0)
-    np.testing.assert_array_equal(list(content["scales"].values()), means)
+    np.testing.assert_array_equal(list(content["scales"].values()), whole.penalties[~whole.reached_goal].mean(axis=0))
 
 
 def test_a_penalty_that_never_occurs_is_refused_once_all_scales_are_written(scales):

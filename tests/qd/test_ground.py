@@ -55,11 +55,9 @@ def test_a_run_goes_on_with_its_ground_and_exports_it(run):
 def test_a_minimal_terrain_may_be_a_patch(run):
     archive = read_archive(run).rows(np.arange(1))
     archive.genes[0, 64:96], archive.genes[0, 96:] = -1.0, 1.0  # slippery and soft everywhere
-    fresh = replace(fresh_values(archive), goal_rate=np.zeros(1))
-    write_archive(run / "archive.npz", archive.corrected_by(fresh))
+    write_archive(run / "archive.npz", archive.corrected_by(replace(fresh_values(archive), goal_rate=np.zeros(1))))
     ice = Robots(lambda cfg, genes, seeds: genes[:, 64 + 11] < 0.0)  # robots fall on patch 11, in the middle of the way
-    minima = minimise(run, compute=stand_in.compute_by(ice), elite="0", how="greedy")
-    (entry,) = minima.numbers["elites"]
+    (entry,) = minimise(run, compute=stand_in.compute_by(ice), elite="0", how="greedy").numbers["elites"]
     assert entry["bumps"] == [8 + 11] and entry["of"] >= 64 and entry["cause"]["kind"] == "slippery ground"
     assert (entry["height_m"], entry["scale"], entry["margin_m"], entry["scales"]) == (0.0, None, None, [])
     ExportCommand(run=run, minimal="all", formats=("npz",)).execute()

@@ -208,8 +208,7 @@ def searched(places):
     """A run of a search whose controller fails 8 of its 10 elites in fresh episodes."""
     archive = make_archive(10)
     fresh = replace(fresh_values(archive), goal_rate=np.array([0.1] * 8 + [0.9] * 2))
-    digest = controller_hash(places / "start.pt")
-    archive = replace(archive, fresh=fresh, policy_sha256=digest)
+    archive = replace(archive, fresh=fresh, policy_sha256=controller_hash(places / "start.pt"))
     return write_run(places / "searched", archive, {"policy": str(places / "start.pt")})
 
 

@@ -146,8 +146,7 @@ def test_stopped_it_comes_to_the_same_and_goes_on_for_more_rounds(hardened, plac
     for key in ("rounds", "choices", "tables", "settings"):
         assert again[key] == expected[key], key
     world = World()
-    longer = hardened(world)
-    assert longer["rounds"][:2] == again["rounds"]
+    assert hardened(world)["rounds"][:2] == again["rounds"]
     assert (list(world.searched), list(world.trained)) == (["search-2"], ["tune-2"])
     with pytest.raises(ValueError, match="rounds"):
         hardened(World(), rounds=1)

@@ -84,11 +84,9 @@ def read_start(path: Path, robot: RobotCfg) -> Start:
         return replace(start, controller=replace(policy.cfg, policy=POLICY, activation=network.activation))
     content = read_weights(path) if isinstance(policy, MlpPolicy) else {}
     if not isinstance(policy, MlpPolicy) or policy.activation != "elu" or "actor_state_dict" not in content:
-        raise ValueError(
-            "a fine-tuning starts from a controller.toml, or from an rsl_rl 5 checkpoint (actor_state_dict) with ELU "
-            f"between its layers, got another kind of controller: {path}; describe it in a controller.toml, or train "
-            f"one with `{robot.train_command}`"
-        )
+        rule = "a controller.toml, or from an rsl_rl 5 checkpoint (actor_state_dict) with ELU between its layers"
+        remedy = f"describe it in a controller.toml, or train one with `{robot.train_command}`"
+        raise ValueError(f"a fine-tuning starts from {rule}, got another kind of controller: {path}; {remedy}")
     actor = {key: value for key, value in content["actor_state_dict"].items() if not key.startswith("obs_normalizer.")}
     critic = None if policy.normalised else content.get("critic_state_dict")
     return _make_start(policy, actor, critic, robot, path)
@@ -102,10 +100,9 @@ def _make_start(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, p
     std = actor.get(STD)
     count = policy.sizes[1]
     if std is not None and (std.shape != (count,) or not bool(((std > 0.0) & std.isfinite()).all())):
-        raise ValueError(
-            f"{path}: {STD}, the standard deviation of the actions, must be {count} numbers above 0, got "
-            f"{' '.join(str(std).split())}: leave it out, or give another controller"
-        )
+        rule = f"{path}: {STD}, the standard deviation of the actions, must be {count} numbers above 0"
+        got = " ".join(str(std).split())
+        raise ValueError(f"{rule}, got {got}: leave it out, or give another controller")
     if critic is not None:
         expected = {}
         for k, (width, out) in enumerate(pairwise((robot.observation_size, *hidden, 1))):
@@ -113,10 +110,8 @@ def _make_start(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, p
         tensors = isinstance(critic, dict) and all(isinstance(value, torch.Tensor) for value in critic.values())
         shapes = {key: tuple(value.shape) for key, value in critic.items()} if tensors else {}
         if shapes != expected or not all(bool(value.isfinite().all()) for value in critic.values()):
-            raise ValueError(
-                f"{path}: critic_state_dict must have finite weights and the actor's hidden layers {list(hidden)}, got "
-                "others: leave it out of the file, and a critic is trained"
-            )
+            rule = f"{path}: critic_state_dict must have finite weights and the actor's hidden layers {list(hidden)}"
+            raise ValueError(f"{rule}, got others: leave it out of the file, and a critic is trained")
     return Start(actor=actor, critic=critic, hidden_dims=hidden)
 
 
@@ -147,7 +142,5 @@ def plain_layers(network: Any, name: str) -> MlpPolicy:
                 return policy
         except (KeyError, RuntimeError):
             break
-    raise ValueError(
-        f"finetune needs a network of plain layers with one kind of activation, got another in {name}: give an rsl_rl "
-        "checkpoint or its TorchScript as the description's policy"
-    )
+    rule = f"finetune needs a network of plain layers with one kind of activation, got another in {name}"
+    raise ValueError(f"{rule}: give an rsl_rl checkpoint or its TorchScript as the description's policy")

@@ -207,8 +207,7 @@ class Learner:
         alg.train_mode()
         with torch.inference_mode():
             for _ in range(self.cfg.steps_per_env):
-                actions = alg.act(self._observations)
-                self._observations, rewards, dones, extras = self.env.step(actions)
+                self._observations, rewards, dones, extras = self.env.step(alg.act(self._observations))
                 alg.process_env_step(self._observations, rewards, dones, extras)
             alg.compute_returns(self._observations)
         if rewards.is_cuda:
@@ -219,10 +218,8 @@ class Learner:
         parameters = [*alg.actor.parameters(), *alg.critic.parameters()]
         sums = torch.stack([parameter.detach().sum() for parameter in parameters]).tolist()
         if not all(map(math.isfinite, [*losses.values(), *sums])):
-            raise FloatingPointError(
-                f"iteration {self.iteration}: losses and weights must be finite, got losses {losses} or weights that "
-                "are not: begin again with a lower --ppo.learning-rate"
-            )
+            got = f"losses {losses} or weights that are not: begin again with a lower --ppo.learning-rate"
+            raise FloatingPointError(f"iteration {self.iteration}: losses and weights must be finite, got {got}")
         self.iteration += 1
         return Iteration(collection_s=collected - began, learning_s=time.perf_counter() - collected, losses=losses)
 

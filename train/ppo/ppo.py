@@ -90,8 +90,7 @@ class CapturedPPO(PPO):
         """Run all epochs over the stored rollout; returns the mean value, surrogate and entropy losses."""
         self._advantages.copy_(self.storage.advantages.flatten(0, 1))
         self._losses.zero_()
-        size = self._index.shape[0]
-        order = torch.randperm(self.num_mini_batches * size, device=self.device)
+        order = torch.randperm(self.num_mini_batches * self._index.shape[0], device=self.device)
         if self._stream is None:
             self._run_epochs(order)
         else:

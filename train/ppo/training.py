@@ -93,10 +93,8 @@ def find_device(name: str | None) -> str:
     """Warp device name of this process of a training; ``name`` is what the user asked for."""
     device = Ranks.from_environment().device(resolve_device(name))
     if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(
-            f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA: install a CUDA build "
-            "or use --device cpu"
-        )
+        problem = f"device '{device}' asked for, but this torch ({torch.__version__}) has no CUDA"
+        raise ValueError(f"{problem}: install a CUDA build or use --device cpu")
     return device
 
 
@@ -129,10 +127,8 @@ def read_saved(run_dir: Path, kind: Literal["train", "finetune"], robot: str) ->
     """The checkpoint in a training's directory; refuses one of another kind or robot."""
     saved = read_checkpoint(run_dir / CHECKPOINT)
     if (saved["kind"], saved["robot"]) != (kind, robot):
-        raise ValueError(
-            f"{run_dir} must hold a run of `faultline {kind} --robot {robot}`, got one of `faultline {saved['kind']}` "
-            f"with robot {saved['robot']}: give another directory"
-        )
+        got = f"one of `faultline {saved['kind']}` with robot {saved['robot']}: give another directory"
+        raise ValueError(f"{run_dir} must hold a run of `faultline {kind} --robot {robot}`, got {got}")
     return saved
 
 

@@ -176,10 +176,8 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
     file = run.path / METRICS_FILE  # a run that goes on meanwhile may have some rows more
     metrics = run.read_metrics()[: archive.iterations] if file.exists() else []
     if file.exists() and len(metrics) < archive.iterations:
-        raise ValueError(
-            f"{file} must have a row for each of {archive.iterations} iterations, got {len(metrics)}: resume the "
-            "search, which writes it again"
-        )
+        rule = f"{file} must have a row for each of {archive.iterations} iterations, got {len(metrics)}"
+        raise ValueError(f"{rule}: resume the search, which writes it again")
     controller = "its own controller" if searched == SHIPPED else ControllerSpec.parse(searched).label
     if search is None and opened_run.suffix(resolve_policy(SHIPPED, opened_run.robot)):
         controller = "a controller that is not at hand"
@@ -227,16 +225,10 @@ def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
         rest = [groups.pop(cause) for cause in [*groups][_MAX_BARS - 1 :]]
         groups[f"{len(rest)} other causes"] = np.concatenate(rest)
     longest = max(map(len, groups.values()), default=1)
-    return [
-        {
-            "name": name,
-            "failing": len(rows),
-            "faults": int((ranking.verdict[rows] == _FAULT).sum()),
-            "share": 100.0 / longest,
-            "tile": tiles.get(name),
-        }
-        for name, rows in groups.items()
-    ]
+    bars = {name: {"name": name, "failing": len(rows), "tile": tiles.get(name)} for name, rows in groups.items()}
+    for name, rows in groups.items():
+        bars[name] |= {"faults": int((ranking.verdict[rows] == _FAULT).sum()), "share": 100.0 / longest}
+    return [*bars.values()]
 
 
 def _list_elites(ranking: Ranking) -> dict[str, Any]:

@@ -143,6 +143,5 @@ def check_port(host: str, port: int) -> None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server has it
             probe.bind(address)
     except OSError as error:
-        raise ValueError(
-            f"nothing can be served at port {port} of {host}: {error.strerror or error}: give another --port or --host"
-        ) from None
+        problem = f"port {port} of {host}: {error.strerror or error}"
+        raise ValueError(f"nothing can be served at {problem}: give another --port or --host") from None

@@ -152,8 +152,7 @@ class ArchivePanel:
             panel.minimize()
         with panel.add_tab("Archive"):
             title = f"{show.robot.name} · {show.folder} · {len(show.archive):,} elites"
-            summary = summarise_search(show.ranking, show.archive)
-            gui.add_html(_small(f"{escape(title)}<br><b>{escape(summary)}.</b>"))
+            gui.add_html(_small(f"{escape(title)}<br><b>{escape(summarise_search(show.ranking, show.archive))}.</b>"))
             orders = {label: name for name, label in ORDERS.items()}
             choose = partial(tab.shared.post, self._choose)
             _add_choice(gui, "Cause", show.causes(), partial(choose, "cause"))
@@ -288,5 +287,4 @@ def _add_choice(gui: Any, label: str, options: Mapping[str, Any], act: Callable[
 
 def _add_buttons(gui: Any, label: str, tasks: dict[str, tuple[Any, ...]], post: Callable[..., None]) -> None:
     """Buttons side by side, each with what the loop is to call."""
-    buttons = gui.add_button_group(label, tuple(tasks))
-    buttons.on_click(lambda event: post(*tasks[event.target.value]))
+    gui.add_button_group(label, tuple(tasks)).on_click(lambda event: post(*tasks[event.target.value]))

@@ -133,7 +133,6 @@ def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]
 
 def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, ...]]]:
     """The base at every tenth frame and the last [m], (num_points, 3), and the outcome's colour, by episode."""
-    outcomes = recording.outcome[0].tolist()
-    colors = [ImageColor.getrgb(get_ending(outcome).color) for outcome in outcomes]
+    colors = [ImageColor.getrgb(get_ending(outcome).color) for outcome in recording.outcome[0].tolist()]
     chosen = [[*range(0, last, every), last] if last >= 0 else [] for last in (recording.num_frames[0] - 1).tolist()]
     return [(recording.base_position[0, k, chosen[k]], color) for k, color in enumerate(colors)]

@@ -23,8 +23,7 @@ def read_legged_gym(path: Path, source: Source) -> Path:
     else:
         stiffness, damping = (source.match_parts(control[name], name) for name in ("stiffness", "damping"))
         source.set(stiffness=stiffness, damping=damping)
-    angles = cfg["init_state"]["default_joint_angles"]
-    source.set(default_joint_pos=[angles[joint] for joint in source.joints])
+    source.set(default_joint_pos=[cfg["init_state"]["default_joint_angles"][joint] for joint in source.joints])
     source.set(physics_dt=cfg["sim"]["dt"], decimation=control["decimation"], action_scale=control["action_scale"])
     source.set(action_clip=normalization["clip_actions"], observation_clip=normalization["clip_observations"])
     source.set_speed((cfg.get("commands") or {}).get("ranges") or {})

@@ -197,17 +197,13 @@ def _check_heights(heights: NDArray[np.float64], size_m: tuple[float, float]) ->
         raise ValueError(f"{count} of {heights.size} heights are NaN or infinite: fill them first")
     low, high = float(heights.min()), float(heights.max())
     if max(-low, high) > _MAX_HEIGHT_M:
-        raise ValueError(
-            f"heights must lie in +-{_MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: are they metres (--scale), and is "
-            "the ground about 0 (--offset)?"
-        )
+        remedy = "are they metres (--scale), and is the ground about 0 (--offset)?"
+        raise ValueError(f"heights must lie in +-{_MAX_HEIGHT_M:g} m, got {low:g} to {high:g} m: {remedy}")
     (rows, columns), (size_x, size_y) = heights.shape, size_m
     now, turned = size_x / (columns - 1) * (rows - 1) / size_y, size_x / (rows - 1) * (columns - 1) / size_y
     if abs(np.log(turned)) < 0.01 and abs(np.log(now)) > np.log(2.0):
-        raise ValueError(
-            f"heights must be (nrow, ncol) with rows along y, got {heights.shape} over {size_x:g} m along x and "
-            f"{size_y:g} m along y: x and y are swapped; transpose them"
-        )
+        got = f"{heights.shape} over {size_x:g} m along x and {size_y:g} m along y: x and y are swapped"
+        raise ValueError(f"heights must be (nrow, ncol) with rows along y, got {got}; transpose them")
 
 
 def as_terrain(heightmap: Heightmap) -> NDArray[np.float32]:

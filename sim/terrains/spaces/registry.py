@@ -133,9 +133,8 @@ class UserSpace(TerrainSpace):
         return self._call_for_genes("scaled", clipped(self.validate(genes)), scale)
 
     def _call_for_genes(self, method: str, *arguments: Any) -> NDArray[np.float32]:
-        returned = self._call(method, *arguments)
         try:
-            return clipped(self.validate(returned))
+            return clipped(self.validate(self._call(method, *arguments)))
         except (TypeError, ValueError) as error:
             raise self._wrong(method, f"must return genes: {error}") from None
 
@@ -234,10 +233,8 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
         space = find_user_space(base, sha256)
     else:
         kinds_text = ", ".join(f"+{kind}" for kind in (*GROUND_KINDS, *CONDITIONS))
-        raise ValueError(
-            f"unknown terrain space '{name}': expected one of {', '.join(SPACES)}, or file.py:CLASS, and behind it "
-            f"some of {kinds_text}"
-        )
+        expected = f"one of {', '.join(SPACES)}, or file.py:CLASS, and behind it some of {kinds_text}"
+        raise ValueError(f"unknown terrain space '{name}': expected {expected}")
     ground = [kind for kind in kinds if kind in GROUND_KINDS]
     if ground and space.ground:
         raise ValueError(f"the space {base} has its ground already, got {name}: leave +{'+'.join(ground)} out")
@@ -251,10 +248,8 @@ def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> Terr
     fits = MAX_HEIGHT * get_space(fitting_space(robot) or SUPER_GAUSSIAN.name).height_share
     if fits == MAX_HEIGHT or space.height_share != 1.0 or is_user_space(space.name):
         return space
-    print(
-        f"Heights up to {fits:g} m, as of the penalty scales of {robot.name} (--height, or --space "
-        f"{SUPER_GAUSSIAN.name}@{MAX_HEIGHT:g}, says otherwise)."
-    )
+    otherwise = f"(--height, or --space {SUPER_GAUSSIAN.name}@{MAX_HEIGHT:g}, says otherwise)"
+    print(f"Heights up to {fits:g} m, as of the penalty scales of {robot.name} {otherwise}.")
     return at_height(space, fits)
 
 

@@ -36,8 +36,7 @@ class SuperGaussian(ShippedSpace):
 
     def parts(self, genes: ArrayLike) -> tuple[str, ...]:
         """Each bump."""
-        bumps = clipped(genes).reshape(-1, GENES_PER_BUMP)
-        values = LOWER + (bumps + 1.0) / 2.0 * (UPPER - LOWER)
+        values = LOWER + (clipped(genes).reshape(-1, GENES_PER_BUMP) + 1.0) / 2.0 * (UPPER - LOWER)
         values[:, _HEIGHT] *= self.height_share
         return tuple(map(_format_bump, values))
 

@@ -87,8 +87,7 @@ def test_controllers_are_not_tested_on_what_they_were_trained_on(anymal, archive
     if where == "independent":  # whichever elite it is: it shares ancestors with all
         given, trained_on = {"independent": write_elites(tmp_path / "other.npz", 9, seed=1)}, other.genes[:1]
     else:
-        split = split_elites(make_archive(30))
-        given, trained_on = {"archive": archive}, make_archive(30).genes[split.test[:1]]
+        given, trained_on = {"archive": archive}, make_archive(30).genes[split_elites(make_archive(30)).test[:1]]
     with pytest.raises(ValueError, match="C-G"):
         tables_of(anymal, Robots(arrives), {"C-G": str(write_trained(tmp_path, trained_on))}, **given)
     assert not Path("runs").exists()

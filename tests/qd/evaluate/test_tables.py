@@ -301,8 +301,7 @@ def test_a_split_follows_from_the_elites_alone():
 
 def test_sets_have_random_numbers_of_their_own():
     names = ("hand_crafted", "hard_random", "flat", "generated", "generated_independent", "pack", "dose")
-    ways = itertools.product(names, (0, 1), ("test", "validation"))
-    draws = [set_rng(*way).integers(2**63) for way in ways]
+    draws = [set_rng(*way).integers(2**63) for way in itertools.product(names, (0, 1), ("test", "validation"))]
     draws += [np.random.default_rng(seed).integers(2**63) for seed in range(3)]
     assert len(set(draws)) == 31
 
@@ -368,8 +367,7 @@ def test_the_far_third_is_the_farthest():
     np.testing.assert_allclose(distance, by_hand, atol=1e-6)
     # Of seven that are held out, the farthest three, with the same episodes.
     archive = make_archive(35)
-    sets = make_sets(("generated", "generated_far"), 300, 0, archive=archive)
-    whole, far = sets.values()
+    whole, far = make_sets(("generated", "generated_far"), 300, 0, archive=archive).values()
     distance = nearest_distance(whole.terrains.genes, archive.genes[split_elites(archive).train])
     chosen = np.sort(np.argsort(distance)[-3:])
     assert far.numbers.tolist() == whole.numbers[chosen].tolist()

@@ -95,8 +95,7 @@ def judged(path, robots=None, stages=("resolved", "others"), certifiers=OTHER, *
 def with_goal_rates(path, goal_rate):
     """Gives the run's elites other goal rates of fresh episodes."""
     archive = read_archive(path)
-    fresh = replace(archive.fresh, goal_rate=goal_rate)
-    write_archive(path / "archive.npz", replace(archive, fresh=fresh))
+    write_archive(path / "archive.npz", replace(archive, fresh=replace(archive.fresh, goal_rate=goal_rate)))
 
 
 def numbers_in(path):
@@ -258,8 +257,7 @@ def test_a_fault_holds_in_mujoco_c_if_the_controller_fails_and_its_best_certifie
 
 def test_mujoco_c_crosses_faults_alone_and_no_soft_ground(path):
     judged(path)
-    nobody_fails = Robots(lambda cfg, genes, seeds: np.zeros(len(genes), bool))
-    archive = judged(path, nobody_fails, stages=("mujoco_c",))
+    archive = judged(path, Robots(lambda cfg, genes, seeds: np.zeros(len(genes), bool)), stages=("mujoco_c",))
     assert not archive.holds_in_mujoco_c.any() and not archive.mujoco_c.certifiers.any()
     write_archive(path / "archive.npz", replace(archive, certifier_outcomes=0 * archive.certifier_outcomes))
     with pytest.raises(ValueError, match=r"stages .* no faults"):
@@ -414,8 +412,7 @@ def test_a_run_that_is_not_whole_is_refused_and_stays(path, made, tmp_path):
     with pytest.raises(ValueError, match=r"archive\.json"):
         judged(path)
     assert (path / "archive.json").read_bytes() == b"[]"
-    archive = read_archive(path)
-    write_archive(path / "archive.npz", replace(archive, scales=(1.0,) * 6))
+    write_archive(path / "archive.npz", replace(read_archive(path), scales=(1.0,) * 6))
     with pytest.raises(ValueError, match="scales"):
         judged(path, nobody)
 

@@ -161,8 +161,7 @@ def test_numbers_of_fresh_episodes_by_hand():
 
 
 def test_sentences_say_counts_and_verdicts():
-    archive = judged_archive()
-    texts = [describe_judgement(archive, number) for number in range(5)]
+    texts = [describe_judgement(judged_archive(), number) for number in range(5)]
     # a fault, confirmed alone, certified alone, failing alone, not failing
     assert ["a fault" in text[-1] for text in texts] == [True, False, False, False, False]
     assert ["not known" in text[-1] for text in texts] == [False, True, False, True, False]

@@ -105,8 +105,7 @@ def test_counts_and_statistics_agree_when_a_terrain_is_invalid_for_a_while(part)
 
 
 def test_few_episodes_show_too_little_spread():
-    rng = np.random.default_rng(0)
-    penalties = rng.normal([5.0, 50.0], [2.0, 20.0], (4000, 20, 2)).clip(0.0)
+    penalties = np.random.default_rng(0).normal([5.0, 50.0], [2.0, 20.0], (4000, 20, 2)).clip(0.0)
     few, many = (evaluate_rollout(make_result(penalties[:, :count]), CELLS, CFG) for count in (3, 20))
     assert few.penalty_std.mean() == pytest.approx(0.72 * 2.0, rel=0.05)
     assert few.spread.mean() == pytest.approx(2.0, rel=0.1)

@@ -58,8 +58,7 @@ def test_the_moment_of_failure_by_hand(recording):
     lying[:, :, 10:15] = lying[:, :, 30:] = [np.cos(np.pi / 4), np.sin(np.pi / 4), 0.0, 0.0]  # rolled by 90 degrees
     for outcome in (stuck, recording.outcome, np.full((1, 5), Outcome.OUT, np.uint8)):
         assert moment(outcome=outcome, base_quaternion=lying) == pytest.approx(0.6)  # it rose from the first fall
-    arrived = np.full((1, 5), Outcome.GOAL, np.uint8)
-    assert moment(outcome=arrived, base_quaternion=lying) == pytest.approx(5.0)
+    assert moment(outcome=np.full((1, 5), Outcome.GOAL, np.uint8), base_quaternion=lying) == pytest.approx(5.0)
     assert moment(num_frames=np.full((1, 5), 31, np.int32)) == pytest.approx(0.6)
 
 

@@ -133,8 +133,7 @@ def test_invalid_episodes_are_left_out_of_the_rates():
 
 
 def test_the_drawing_has_all_paths():
-    recording = recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0])
-    figure = draw_crossing(recording, "a hill")
+    figure = draw_crossing(recording_of([Outcome.GOAL, Outcome.TIME_OUT], [12.0, 2.0]), "a hill")
     axes = figure.axes[0]
     assert sum(len(np.asarray(line.get_xdata())) == FRAMES for line in axes.lines) == 2
     assert axes.images[0].get_array().shape == (161, 321)

@@ -166,8 +166,7 @@ def test_the_first_worker_too_leaves_ctrl_c_to_its_parent():
 
 
 def test_leaving_ends_workers_in_the_midst_of_work(tmp_path):
-    cfg = replace(CFG, policy=f"sleep:{tmp_path}:2")
-    with open_pipeline(cfg, build=stand_in.Failing) as evaluate:
+    with open_pipeline(replace(CFG, policy=f"sleep:{tmp_path}:2"), build=stand_in.Failing) as evaluate:
         evaluate.put(drawn(slice(6)))
         began = time.monotonic()
     assert time.monotonic() - began < 15 and not multiprocessing.active_children()

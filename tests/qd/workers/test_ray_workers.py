@@ -64,8 +64,7 @@ def test_how_terrains_are_spread_changes_nothing_even_after_a_stop(cluster):
 
 @pytest.mark.parametrize("how", ["die", "raise", "nan"])
 def test_terrains_of_a_worker_that_failed_are_crossed_again(cluster, tmp_path, how):
-    cfg = replace(CFG, policy=f"{how}:{tmp_path}:3")
-    with open_pipeline(cfg, build=stand_in.Failing) as evaluate:
+    with open_pipeline(replace(CFG, policy=f"{how}:{tmp_path}:3"), build=stand_in.Failing) as evaluate:
         for _ in range(3):
             assert_crossed(evaluate(TERRAINS), slice(21))
         assert evaluate.status().retries == 3

@@ -43,8 +43,7 @@ def record(rollout, terrains, *, labels=("one", "two"), progress=None) -> Record
     recorder.put(terrains)
     robot = rollout.robot
     result = recorder.take(progress)
-    policy = str(robot.policy_file)
-    return make_recording(robot, policy, terrains, result, device=rollout.sim.device, labels=labels)
+    return make_recording(robot, str(robot.policy_file), terrains, result, device=rollout.sim.device, labels=labels)
 
 
 def test_recorded_episodes_are_those_of_an_evaluation(rollout, recording):

@@ -199,8 +199,7 @@ def test_mesh(name):
     hull = ConvexHull(vertices)
     faces = trimesh.convex.convex_hull(vertices).sample(6000, seed=1)
     edges = hull.points[hull.simplices[:, [0, 1, 2, 0]]]
-    between = np.linspace(edges[:, :3], edges[:, 1:], 9).reshape(-1, 3)
-    gap = uncovered(np.vstack([faces, between]), strips)
+    gap = uncovered(np.vstack([faces, np.linspace(edges[:, :3], edges[:, 1:], 9).reshape(-1, 3)]), strips)
     assert gap.max() <= tolerance
     assert gap.max() > 0.3 * tolerance, "far more probes than it takes"
     sticking_out = centres @ hull.equations[:, :3].T + hull.equations[:, 3] + radii[:, None]

@@ -235,8 +235,7 @@ def test_an_element_of_a_course_has_its_ground_behind_it():
         "kerb 0.15 m up (friction 0.25), ditch 0.40 m wide and 0.40 m deep (friction 0.25), "
         "3 stairs of 0.18 x 0.25 m down (friction 0.25, soft, 0.060 s)"
     )
-    flat = np.concatenate([course()[0], np.full(64, -1.0)])
-    assert space.describe(flat).splitlines()[0] == "flat ground"
+    assert space.describe(np.concatenate([course()[0], np.full(64, -1.0)])).splitlines()[0] == "flat ground"
 
 
 def test_ground_is_named_by_the_space(tmp_path):
@@ -398,8 +397,7 @@ def test_a_condition_appears_wherever_conditions_do(name):
     without = space.without(genes, [part])
     np.testing.assert_array_equal(space.condition_rows(without), nominal_row()[None])
     assert space.parts(without[0])[part] == f"no {name}"
-    effects = find_effects(genes[0], [part], space)
-    assert effects.shape(0, 0.3).kind == condition.cause
+    assert find_effects(genes[0], [part], space).shape(0, 0.3).kind == condition.cause
     assert num_maps(space) == len(condition.genes) == corridor_maps(torch.as_tensor(genes), space).shape[1]
     assert f"+{name}" in ArchiveCommand.help_values()["conditions"]
     assert (name in varied_space(SUPER_GAUSSIAN).conditions) == (condition.varied is not None)
@@ -407,8 +405,7 @@ def test_a_condition_appears_wherever_conditions_do(name):
         assert name in DoseCommand.help_values()["conditions"]
         dose = parse_doses([name], [])[name]
         rows = get_space(dose.space).condition_rows(dose.terrains(1, np.random.default_rng(0)))
-        column = condition_column(condition.dose.parameter)
-        np.testing.assert_allclose(rows[:, column], dose.values, atol=1e-6)
+        np.testing.assert_allclose(rows[:, condition_column(condition.dose.parameter)], dose.values, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ELEMENTS)

@@ -439,8 +439,7 @@ def test_tiles_of_the_curriculum():
     assert (tiles.num_levels, tiles.num_columns) == (NUM_LEVELS, 7)
     assert tiles.type_of_column[-2:] == ("noise", "noise")
     without_noise = tiles.heights.reshape(NUM_LEVELS, 7, NUM_ROWS, NUM_COLS)[:, :5].reshape(-1, NUM_ROWS, NUM_COLS)
-    rng = np.random.default_rng(3).spawn(2)[0]
-    np.testing.assert_array_equal(without_noise, training_tiles(5, rng)[0])
+    np.testing.assert_array_equal(without_noise, training_tiles(5, np.random.default_rng(3).spawn(2)[0])[0])
     # Noise grows with the level.
     for level in range(NUM_LEVELS):
         tile = tiles.heights[level * 7 + 6]

@@ -45,9 +45,8 @@ def reported(run, monkeypatch):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A report with its figures, as anyone would get it; not to be changed."""
-    run = make_run(tmp_path_factory.mktemp("whole"))
     with pytest.MonkeyPatch.context() as patch:
-        return reporter(run, patch)(num_elites=2)
+        return reporter(make_run(tmp_path_factory.mktemp("whole")), patch)(num_elites=2)
 
 
 def test_the_page_is_whole_and_fetches_nothing(whole):
@@ -280,8 +279,7 @@ def test_what_is_no_hardening_is_refused(tmp_path):
 
 
 def test_curves_show_what_the_metrics_say():
-    metrics = rows(4)
-    figure = draw_curves(small_archive(), metrics)
+    figure = draw_curves(small_archive(), rows(4))
     left, middle, right, *_ = figure.axes
     assert left.lines[0].get_xydata().tolist() == [[1, 20], [2, 40], [3, 60], [4, 80]]
     assert middle.lines[0].get_ydata().tolist() == [5, 10, 15, 20]

@@ -52,8 +52,7 @@ def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
 
 
 def test_the_command_points_where_the_robot_is_told_to_go(skeleton, recording):
-    crossing = trace_crossing(recording, 0, skeleton, {})
-    begin, end = crossing.command[0]
+    begin, end = trace_crossing(recording, 0, skeleton, {}).command[0]
     # it looks along y: .75 forward is along y, .25 to its left against x
     np.testing.assert_allclose(end - begin, [-0.25, 0.75, 0.0], atol=1e-6)
     np.testing.assert_allclose(begin[:2], [2.0, 4.0], atol=1e-6)

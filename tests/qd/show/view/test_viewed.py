@@ -69,8 +69,7 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way(anymal):
     # 9 at the goal, 6 base collisions and 5 others with contact resolved; S crosses it 10 times, C-G 9
     assert resolved == ("finer contact", 20, {"goal_rate": 9, "collision_rate": 6, "other_rate": 5})
     assert certifier == ("S", 20, {"goal_rate": 10, "collision_rate": 10, "other_rate": 0})
-    recording = recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False])
-    recorded = count_endings("here", recording)
+    recorded = count_endings("here", recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False]))
     assert recorded[1:] == (4, {"goal_rate": 1, "collision_rate": 2, "other_rate": 1, "fallen_rate": 1})
     table = render_rates([resolved, recorded])
     assert [re.sub("<.*?>", "|", row).count("%") for row in table.split("</tr>")[1:5]] == [4, 4, 4, 2]
@@ -81,8 +80,7 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way(anymal):
 def test_an_elite_whose_fresh_episodes_are_invalid_is_listed_as_found(anymal):
     archive = dataclasses.replace(small_archive(3), collision_rate=np.array([0.0, 0.5, 1.0]))
     fresh = dataclasses.replace(fresh_values(archive), invalid_episodes=np.array([0, 0, 39]))
-    show = list_archive(dataclasses.replace(archive, fresh=fresh), anymal)
-    ((head, count, hits),) = show.columns(2)
+    ((head, count, hits),) = list_archive(dataclasses.replace(archive, fresh=fresh), anymal).columns(2)
     assert (head, count, hits["collision_rate"]) == ("as found", 4, 4)
 
 
