@@ -29,16 +29,7 @@ from qd.faults.numbers import (
 )
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
 from qd.faults.steer import LINE_M, SteerCfg, measure_line, seek_witnesses
-from qd.search.archive import (
-    ARCHIVE_FILE,
-    OUTCOMES,
-    Archive,
-    CrossedAgain,
-    FreshValues,
-    goal_rates,
-    no_witnesses,
-    write_archive,
-)
+from qd.search.archive import OUTCOMES, Archive, CrossedAgain, FreshValues, goal_rates, no_witnesses, write_archive
 from qd.search.directory import METRICS_FILE, SUMMARY_FILE, RunDirectory, claimed
 from qd.search.fitness import BIT_EPISODES, FAILING_GOAL_RATE, FitnessCfg, evaluate_rollout
 from qd.show import figures
@@ -476,7 +467,7 @@ def _write(archive: Archive, judging: Judging, stage: str) -> None:
         numbers |= found_numbers(archive, metrics[: archive.iterations])
     numbers |= fresh_numbers(archive, archive.fresh) | judged_numbers(archive, judging.search.space)
     numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin}
-    write_archive(run.path / ARCHIVE_FILE, archive)
+    write_archive(run.path, archive)
     write_atomically(file, to_json(numbers))
     if metrics:
         figures.write_figures(run.path, archive, metrics)

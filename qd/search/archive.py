@@ -302,7 +302,7 @@ _FINITE = ("genes", "fitness", "scales", "witness_way", "witness_limit_m")
 
 
 def write_archive(path: Path, archive: Archive) -> None:
-    """Writes an archive as a compressed npz, atomically; equal archives give equal bytes."""
+    """Writes an archive, a file or that of a run directory, as an npz, atomically; equal archives give equal bytes."""
     groups = (_SETTINGS, _FOUND, _GROUPED, _CROSSED if archive.is_judged else {})
     values = {name: getattr(archive, name) for group in groups for name in group}
     for field, (_, columns) in _TABLES.items():
@@ -312,7 +312,7 @@ def write_archive(path: Path, archive: Archive) -> None:
     arrays = {name: np.asarray(value) for name, value in values.items() if value is not None}
     if archive.is_judged:
         arrays |= {"confirmed": archive.confirmed, "certified": archive.certified}
-    write_atomically(path, npz_bytes(arrays))
+    write_atomically(path / ARCHIVE_FILE if os.path.isdir(path) else path, npz_bytes(arrays))
 
 
 def read_archive(path: str | Path) -> Archive:

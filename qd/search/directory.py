@@ -207,7 +207,7 @@ class RunDirectory:
         """Writes the files that follow from a checkpoint: metrics and archive."""
         rows = "".join(json.dumps(row, allow_nan=False) + "\n" for row in metrics)
         write_atomically(self.path / METRICS_FILE, rows.encode())
-        write_archive(self.path / ARCHIVE_FILE, archive)
+        write_archive(self.path, archive)
 
     def load(self, cfg: SearchCfg) -> tuple[Any, Metrics]:
         """Scheduler and metrics of the search that is to go on, as its checkpoint has them.
