@@ -103,12 +103,9 @@ def rate_table(rows: Mapping[str, tuple[str, str, str]], *, short: bool = False)
 
 def archives() -> str:
     """Counts of the published searches, beside the paper's."""
-    rows = {
-        f"{label}{', CMA-MAE' * name.endswith('mae')}": read(f"results/{robot}/{name}/archive.json")
-        for robot, label in ROBOTS.items()
-        for name in ("archive", "archive_cma_mae")
-    }
-    paper = read(PAPER)
+    rows, paper = {}, read(PAPER)
+    for (robot, label), name in product(ROBOTS.items(), ("archive", "archive_cma_mae")):
+        rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = read(f"results/{robot}/{name}/archive.json")
     rows |= {f"{label}, the paper": {"episodes": 4e6, **paper[robot]["archive"]} for robot, label in ROBOTS.items()}
 
     def holding(row: Mapping[str, Any]) -> str:
@@ -182,10 +179,9 @@ def beside_paper() -> str:
         return f"{ours} ({paper:{'.1f' if measure == 'reward' else '.3f'}})"
 
     labels = {"success": "no base collision", "reward": "reward"}
-    columns = {
-        f"{labels[measure]}, {name}": partial(compare, measure=measure, controller=name)
-        for measure, name in product(labels, controllers)
-    }
+    columns: dict[str, Column] = {}
+    for measure, name in product(labels, controllers):
+        columns[f"{labels[measure]}, {name}"] = partial(compare, measure=measure, controller=name)
     return table(rows, columns)
 
 

@@ -206,11 +206,8 @@ def training_rates(script: Script, device: str) -> dict[str, Any]:
     Rates of several GPUs may be of another host. Each row of ``training`` has its command, commit and date.
     """
     rows = script.read_so_far(script.out.with_name("train_speed.json")).get("rows", [])
-    rates = {
-        (row.get("peer", "")[:5], row["gpus"], row["num_envs"]): row["train_env_steps_per_s"]
-        for row in rows
-        if row["device"] == device or row["gpus"] > 1
-    }
+    known = [row for row in rows if row["device"] == device or row["gpus"] > 1]
+    rates = {(row.get("peer", "")[:5], row["gpus"], row["num_envs"]): row["train_env_steps_per_s"] for row in known}
     keys = {("", 1, 4096): "", ("", 1, 8192): "_8192", ("", 2, 8192): "_2gpu", ("mjlab", 1, 4096): "_mjlab"}
     return {f"train_env_steps_per_s{key}": rates.get(row) for row, key in keys.items()} | {"training": rows}
 

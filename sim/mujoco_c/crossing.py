@@ -264,14 +264,11 @@ class MujocoC:
         for index, (grid, seed) in enumerate(zip(heights, terrains.seeds, strict=True)):
             starts = draw_starts(self._robot, grid, int(seed), self._replicas, self._device)
             maps = None if ground is None else ground[index : index + 1]
-            how = {"time_constant_s": self._time_constant_s, "ground": maps}
-            ways = None if terrains.steering is None else terrains.steering[index]
-            crossed = [
-                cross_in_mujoco_c(
-                    self._robot, self._policy, grid, starts[some], steering=None if ways is None else ways[some], **how
-                )
-                for some in (slice(first, first + _CHUNK) for first in range(0, self._replicas, _CHUNK))
-            ]
+            how: dict[str, Any] = {"time_constant_s": self._time_constant_s, "ground": maps}
+            crossed = []
+            for some in (slice(first, first + _CHUNK) for first in range(0, self._replicas, _CHUNK)):
+                how["steering"] = None if terrains.steering is None else terrains.steering[index, some]
+                crossed.append(cross_in_mujoco_c(self._robot, self._policy, grid, starts[some], **how))
             results.append(RolloutResult.join(crossed, axis=1))
             if progress is not None:
                 progress((index + 1) / len(heights))

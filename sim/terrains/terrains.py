@@ -155,11 +155,8 @@ class Terrains:
     def join(parts: Sequence["Terrains"]) -> "Terrains":
         """The terrains of all parts in their order; the parts are of one space and of one kind."""
         grounds = [part.ground for part in parts if part.ground is not None]
-        arrays: dict[str, Any] = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("seeds", "genes", "heights", "steering")
-            if getattr(parts[0], name) is not None
-        }
+        names = [name for name in ("seeds", "genes", "heights", "steering") if getattr(parts[0], name) is not None]
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         return replace(parts[0], **arrays, ground=reduce(GroundMaps.joined, grounds) if grounds else None)
 
     def digests(self) -> list[bytes]:

@@ -371,12 +371,9 @@ class TrainingProgress:
         if learner.ranks.is_first:
             self._print(row)
             groups = {"train": row} | {name: values for name, values in row.items() if isinstance(values, dict)}
-            scalars = [
-                Summary.Value(tag=f"{group}/{name}", simple_value=value)
-                for group, values in groups.items()
-                for name, value in values.items()
-                if isinstance(value, int | float)
-            ]
+            tagged = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+            numbers = {tag: value for tag, value in tagged.items() if isinstance(value, int | float)}
+            scalars = [Summary.Value(tag=tag, simple_value=value) for tag, value in numbers.items()]
             _write_event(self._events, Event(step=learner.iteration, summary=Summary(value=scalars)))
 
     def _print(self, row: dict[str, Any]) -> None:

@@ -76,14 +76,8 @@ class CommandTask:
         self._noise = self.sim.make_noise(cfg.noise)
         self.max_episode_steps: int = self._task.max_steps
         self._episodes = make_episodes(num_envs, device)
-        self._training = training = make_training(
-            columns,
-            levels,
-            num_joints=robot.num_joints,
-            observation_size=robot.observation_size,
-            first_count=first_count,
-            device=device,
-        )
+        sizes = {"num_joints": robot.num_joints, "observation_size": robot.observation_size}
+        self._training = training = make_training(columns, levels, **sizes, first_count=first_count, device=device)
         self._robot_step = self.sim.make_step(training.command, training.last_action)
         self._reward = Reward(self.sim, cfg, self._robot_step, falls=_FALLS)
         rewards = self._reward.state
