@@ -9,10 +9,10 @@ import pytest
 
 from qd.search import directory
 from qd.search import settings as module
-from qd.search.archive import Archive, FreshValues, Witnesses, goal_rates, read_archive, write_archive
+from qd.search.archive import CrossedAgain, goal_rates, read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint
 from qd.search.directory import RunDirectory, claimed, find_run, output_folder, read_robot_archive, search_seed
-from qd.search.fitness import FitnessCfg
+from qd.search.fitness import FitnessCfg, Table
 from qd.search.presets import SchedulerCfg
 from qd.search.settings import as_settings, differences, is_searched, preset
 from sim.controllers.spec import controller_hash
@@ -160,7 +160,19 @@ def grouped_archive():
     return dataclasses.replace(judged_archive(), family=np.array([0, 1, 0, 2, 3]), cause=causes)
 
 
-ARCHIVES = {"0": small_archive(0), "3": small_archive(3), "judged": grouped_archive(), "steered": steered_archive()}
+AGAIN = CrossedAgain(searched=np.arange(20).reshape(5, 4), certifiers=np.arange(40).reshape(5, 2, 4))
+IN_MUJOCO_C = dataclasses.replace(AGAIN, steered=AGAIN.searched)
+CROSSED = dataclasses.replace(steered_archive(), varied=AGAIN, mujoco_c=IN_MUJOCO_C)
+ARCHIVES = {"0": small_archive(0), "3": small_archive(3), "judged": grouped_archive(), "crossed": CROSSED}
+
+
+def assert_same(stored, table):
+    """Equal columns, and equal tables of further columns."""
+    for name, value in vars(table).items():
+        if isinstance(value, Table):
+            assert_same(getattr(stored, name), value)
+        else:
+            assert np.array_equal(getattr(stored, name), value), name
 
 
 @pytest.mark.parametrize("archive", ARCHIVES.values(), ids=ARCHIVES.keys())
@@ -168,16 +180,7 @@ def test_an_archive_comes_back_whole_and_equal_ones_have_equal_files(tmp_path, a
     for name in ("archive.npz", "again.npz"):
         write_archive(tmp_path / name, archive)
     assert (tmp_path / "archive.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
-    stored = read_archive(tmp_path)
-    for field in dataclasses.fields(Archive):
-        if field.name not in ("fresh", "witnesses"):
-            assert np.array_equal(getattr(stored, field.name), getattr(archive, field.name)), field.name
-    assert (stored.fresh is None) == (archive.fresh is None)
-    for field in dataclasses.fields(FreshValues) if archive.fresh else ():
-        assert np.array_equal(getattr(stored.fresh, field.name), getattr(archive.fresh, field.name)), field.name
-    assert (stored.witnesses is None) == (archive.witnesses is None)
-    for field in dataclasses.fields(Witnesses) if archive.witnesses else ():
-        assert np.array_equal(getattr(stored.witnesses, field.name), getattr(archive.witnesses, field.name)), field.name
+    assert_same(read_archive(tmp_path), archive)
     with np.load(tmp_path / "archive.npz") as arrays:
         assert "confirmed" not in arrays or arrays["confirmed"].tolist() == archive.confirmed.tolist()
 
@@ -185,9 +188,8 @@ def test_an_archive_comes_back_whole_and_equal_ones_have_equal_files(tmp_path, a
 def test_corrected_elites_are_in_order_of_fresh_fitness_and_the_invalid_last():
     archive = small_archive(4)
     # 11 invalid of 40 are more than a quarter, and -20 is what an invalid terrain has; -30 is worse, but valid
-    fresh = dataclasses.replace(
-        fresh_values(archive), fitness=np.array([1.0, -20.0, 5.0, -30.0]), invalid_episodes=np.array([0, 11, 10, 0])
-    )
+    fitness, invalid = np.array([1.0, -20.0, 5.0, -30.0]), np.array([0, 11, 10, 0])
+    fresh = dataclasses.replace(fresh_values(archive), fitness=fitness, invalid_episodes=invalid)
     corrected = archive.corrected_by(fresh)
     order = [2, 0, 3, 1]
     assert corrected.cell.tolist() == order
