@@ -13,7 +13,7 @@ from qd.search.methods import METHODS
 from qd.search.presets import PRESETS, SchedulerCfg, read_preset
 from sim.controllers.spec import parse_controllers
 from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
-from sim.files.settings import NonNegativeInt, PositiveInt, select_settings
+from sim.files.settings import NonNegativeInt, PositiveInt, Share, select_settings
 from sim.robots.find import get_robot, resolve_robot
 
 _METHOD_HELP = (
@@ -72,6 +72,10 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     """Weight of the standard deviations in the fitness."""
     lam: Annotated[float, tyro.conf.arg(name="fitness.lam")] = 2.0
     """Weight of u in the fitness, the share of episodes without base collision; u is 0 if none collided."""
+    crossed: Annotated[Share, tyro.conf.arg(name="fitness.crossed")] = 0.0
+    """How much less, in the search, a terrain is worth that nobody crosses, neither the robot's panel nor, slower or a
+    little aside, the controller itself. Networks learn that from some failing elites; the fitness stays what it is.
+    Only with --method surrogate and --scheduler.again."""
     intervals: Annotated[int, tyro.conf.arg(name="fitness.intervals")] = 10
     """Intervals of each ratio."""
 
@@ -100,7 +104,7 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
 
         cfg = RunDirectory(Path(folder)).read_cfg()
         settings = {name: getattr(cfg, name) for name in _SETTINGS}
-        fitness = {name: getattr(cfg.fitness, name) for name in ("penalties", "alpha", "lam")}
+        fitness = {name: getattr(cfg.fitness, name) for name in ("penalties", "alpha", "lam", "crossed")}
         return cls(**settings, **fitness)
 
     def execute(self) -> None:
@@ -115,6 +119,7 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
         compute = _compute(self)
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
+        scheduler.check_crossed(self.crossed)
         if self.resume is None:
             policy = None
             flags: dict[str, Any] = {"size": self.preset, "height": self.height, "compute": compute}
@@ -131,7 +136,8 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
                 cfg = replace(cfg, space=space.name, space_sha256=space.sha256)
         fitness = cfg.fitness.with_penalties(self.penalties or cfg.fitness.penalties)
         settings = {name: getattr(self, name) for name in _SETTINGS} | {"scheduler": scheduler}
-        cfg = replace(cfg, **settings, fitness=replace(fitness, alpha=self.alpha, lam=self.lam))
+        fitness = replace(fitness, alpha=self.alpha, lam=self.lam, crossed=self.crossed)
+        cfg = replace(cfg, **settings, fitness=fitness)
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
         archive = search(cfg, path, compute, robot=robot, policy=policy, until=self.until)
         named: dict[str, Any] = {"robot": self.robot, "policy": self.policy, "space": self.space}

@@ -23,6 +23,7 @@ from qd.workers.pipeline import Engine, Progress
 from sim.controllers.described import read_speed_limits
 from sim.crossing import CrossingCfg, find_highest_command
 from sim.rates import MAX_INVALID_SHARE
+from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.terrains import Terrains
 
@@ -122,25 +123,40 @@ def find_ways(
 
     Where ``limit_m`` is not None, ways stay so near to the straight line [m].
     """
-    shape = (len(terrains), SEGMENTS, len(STEERING))
-    mean = np.zeros(shape)
-    offset_std = cfg.offset_std if limit_m is not None else 4.0 * cfg.offset_std
-    std = np.broadcast_to([cfg.speed_std, offset_std, cfg.heading_std], shape).copy()
-    offset = limit_m or CrossingCfg.goal[1]
-    speeds = CrossingCfg.lowest_command[0], find_highest_command(CrossingCfg(), crosser.robot)[0]
-    slowest, fastest = np.clip(speeds, *read_speed_limits(policy))  # what its description limits it is not told
-    low, high = [slowest, -offset, -np.pi / 2], [fastest, offset, np.pi / 2]
-    mean[..., 0] = np.clip(crosser.robot.speed, slowest, fastest)
-    mix = mix_segments(SEGMENTS, cfg)
+    mean, std, limits = first_ways(len(terrains), crosser.robot, policy, limit_m, cfg)
     with Bar(label, cfg.generations) as bar:
         for generation in range(cfg.generations):
-            noise = rng.standard_normal((shape[0], cfg.samples, *shape[1:]))
-            ways = np.clip(mean[:, None] + std[:, None] * np.einsum("kl,tslc->tskc", mix, noise), low, high)
+            ways = draw_ways(mean, std, limits, rng, cfg)
             drawn, move = seeds[:, generation], bar.within(generation, 1.0)
             result = cross_ways(crosser, policy, terrains, ways, drawn, label=label, progress=move)
             score = score_ways(result, crosser.robot.max_duration_s, limit_m, cfg)
             mean, std = move_to_best(mean, std, ways, score, cfg)
     return mean.astype(np.float32)
+
+
+def first_ways(
+    count: int, robot: RobotCfg, policy: str, limit_m: float | None, cfg: SteerCfg
+) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+    """Mean and deviation of the first ways on so many terrains, (count, SEGMENTS, 3), and limits of ways, (2, 3)."""
+    shape = (count, SEGMENTS, len(STEERING))
+    mean = np.zeros(shape)
+    offset_std = cfg.offset_std if limit_m is not None else 4.0 * cfg.offset_std
+    std = np.broadcast_to([cfg.speed_std, offset_std, cfg.heading_std], shape).copy()
+    offset = limit_m or CrossingCfg.goal[1]
+    speeds = CrossingCfg.lowest_command[0], find_highest_command(CrossingCfg(), robot)[0]
+    slowest, fastest = np.clip(speeds, *read_speed_limits(policy))  # what its description limits it is not told
+    mean[..., 0] = np.clip(robot.speed, slowest, fastest)
+    return mean, std, np.array([[slowest, -offset, -np.pi / 2], [fastest, offset, np.pi / 2]])
+
+
+def draw_ways(
+    mean: NDArray[np.floating], std: NDArray[np.floating], limits: NDArray[np.floating], rng: np.random.Generator,
+    cfg: SteerCfg,
+) -> NDArray[np.floating]:  # fmt: skip
+    """Samples of a generation on T terrains, shape (T, samples, SEGMENTS, 3), by the columns of :func:`first_ways`."""
+    noise = rng.standard_normal((len(mean), cfg.samples, *mean.shape[1:]))
+    mixed = np.einsum("kl,tslc->tskc", mix_segments(SEGMENTS, cfg), noise)
+    return np.clip(mean[:, None] + std[:, None] * mixed, *limits)
 
 
 def mix_segments(count: int, cfg: SteerCfg) -> NDArray[np.floating]:
@@ -180,11 +196,11 @@ def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, c
 
 def cross_ways(
     crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.floating], seeds: NDArray[np.uint32],
-    label: str, engine: Engine = "search", progress: Progress | None = None,
+    label: str, engine: Engine = "search", progress: Progress | None = None, room: int = 0,
 ) -> RolloutResult:  # fmt: skip
     """Crossings of T terrains, an episode for each way: shape (T, R, SEGMENTS, 3)."""
     steered = replace(terrains, seeds=seeds, steering=ways.astype(np.float32))
-    how: dict[str, Any] = {"replicas": ways.shape[1], "engine": engine, "progress": progress}
+    how: dict[str, Any] = {"replicas": ways.shape[1], "engine": engine, "progress": progress, "room": room}
     return crosser.cross(policy, steered, **how, label=label, invalid_ok=True)
 
 

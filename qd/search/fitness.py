@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from qd.search.descriptors import Cells, terrain_ratios
-from sim.files.settings import PositiveFloat, check_settings
+from sim.files.settings import PositiveFloat, Share, check_settings
 from sim.rates import MAX_INVALID_SHARE, typical_outcome
 from sim.rollout import RolloutResult
 from sim.terrains.terrains import Terrains
@@ -37,6 +37,8 @@ class FitnessCfg:
     """Weight of the standard deviations."""
     lam: float = 2.0
     """Weight of u, the share of episodes without a base collision; u is 0 if none collided."""
+    crossed: Share = 0.0
+    """How much less what nobody crosses is worth in the search (:func:`find_worth`)."""
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -174,6 +176,17 @@ def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> 
     mean, std = (values.sum(axis=1) for values in (evaluation.penalty_mean, evaluation.penalty_std))
     fitness = np.where(evaluation.valid, mean - cfg.alpha * std - cfg.lam * inconsistency, FITNESS_FLOOR)
     return replace(evaluation, fitness=fitness, cell=cells.find_cells(evaluation.ratios, evaluation.collides))
+
+
+def find_worth(fitness: Any, chance: Any, crossed: float) -> Any:
+    """What terrains are worth in the search: less of their fitness above the floor, the less anybody crosses them.
+
+    ``chance`` is that somebody does, and ``crossed`` the share that is lost where nobody does. Fitness and chance are
+    arrays or tensors of one shape.
+    """
+    if not crossed:
+        return fitness
+    return FITNESS_FLOOR + (fitness - FITNESS_FLOOR) * (1.0 - crossed * (1.0 - chance))
 
 
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -1,7 +1,9 @@
 """The search: ask for terrains, let robots cross them, evaluate, tell the emitters, save."""
 
 import time
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from qd.check import ensure_ready
 from qd.search.archive import Archive
+from qd.search.crossed import Labeller
 from qd.search.directory import Metrics, RunDirectory, claimed
 from qd.search.fitness import FAILING_GOAL_RATE, evaluate_rollout, join_evaluations
 from qd.search.progress import Bar
@@ -84,6 +87,7 @@ def search(
     check_policy(policy, robot, compute.device)
     space = get_space(cfg.space, cfg.space_sha256)
     run = RunDirectory(path)
+    labeller = Labeller(cfg, robot, policy, compute) if cfg.fitness.crossed else None
     crossing = PipelineCfg(
         compute=compute,
         robot=robot,
@@ -108,10 +112,10 @@ def search(
             )
             scheduler.compute_on(compute.device)
             try:
-                with open_pipeline(crossing) as pipeline:
+                with open_pipeline(crossing) as pipeline, labeller or nullcontext():
                     run.begin_session(cfg, compute.origin(cfg.seed), done)
                     with Bar(f"iteration {done + 1}/{last}: compiling and evaluating", last, done) as bar:
-                        _run_iterations(cfg, run, scheduler, metrics, pipeline, bar, until)
+                        _run_iterations(cfg, run, scheduler, metrics, pipeline, labeller, bar, until)
             except KeyboardInterrupt:
                 code = {  # which must be named again
                     "robot": robot.spec if robot.settings_file else None,
@@ -140,8 +144,9 @@ def _describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers
 
 
 def _run_iterations(
-    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline, bar: Bar, until: Any
-) -> None:
+    cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline,
+    labeller: Labeller | None, bar: Bar, until: float | None,
+) -> None:  # fmt: skip
     """Runs the iterations that are left in a fixed order, so that a search that goes on is one that never stopped."""
     space = get_space(cfg.space, cfg.space_sha256)
     num_groups = cfg.scheduler.num_groups
@@ -179,6 +184,9 @@ def _run_iterations(
             put(genes, group, iteration + 1)
         archive = build_archive(cfg, scheduler, iteration)
         row = describe_metrics(archive, RolloutResult.join(results), join_evaluations(evaluations))
+        if labeller is not None:
+            labels = labeller.label(scheduler, iteration, partial(bar.move_to, iteration))
+            row |= labels | {"episodes": row["episodes"] + labels["label_episodes"]}
         wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
         began += wall_s
         row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s}

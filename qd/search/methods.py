@@ -61,6 +61,8 @@ class Setup:
     seed: int
     emitters: tuple[int, ...]
     """Numbers of the method's emitters among those of the search, ascending."""
+    crossed: float = 0.0
+    """As :class:`qd.search.fitness.FitnessCfg` has it."""
 
     def stream(self, index: int) -> np.random.SeedSequence:
         """A stream of the search's seed: 0 and 1 are those of archives, 2 and up of emitters, then the surrogate's."""
@@ -265,13 +267,18 @@ class SurrogateSearch(Method):
 
         super().__init__(cfg, setup)
         self.archive = setup.archive
-        self.surrogate = Surrogate(cfg, setup.cells, setup.space, setup.stream(2 + cfg.emitters))
+        stream = setup.stream(2 + cfg.emitters)
+        self.surrogate = Surrogate(cfg, setup.cells, setup.space, stream, crossed=setup.crossed)
 
     def ask(self, emitters: Sequence[int], pending: NDArray[np.float32]) -> NDArray[Any]:
         """What one search by the networks proposes for all of these emitters: no two ask for the same."""
+        from qd.search.fitness import find_worth
+
         elites: Any = self.archive.data()
         count = len(emitters) * self.batch_size
-        return self.surrogate.propose(count, elites["genes"], elites["index"], elites["objective"], pending)
+        chance = self.surrogate.find_chance(elites["genes"], elites["goal_rate"])
+        worth = find_worth(elites["objective"], chance, self.surrogate.crossed)
+        return self.surrogate.propose(count, elites["genes"], elites["index"], worth, pending)
 
     def tell(self, evaluation: Any, rows: Columns, added: Columns, batches: dict[int, slice]) -> None:
         """Trains the networks on what became of all terrains."""

@@ -59,6 +59,9 @@ class Pool:
         solutions: Their unclipped genes, shape (N, num_genes).
         iteration: When each was found, shape (N,).
         number: By which each is known, ascending, shape (N,).
+        chance: That somebody crosses each, as far as the search knows, shape (N,).
+        holds: Whether each held a cell when the cells were settled last, shape (N,).
+        labelled: Whether it was tried if anybody crosses each, shape (N,).
     """
 
     def __init__(self, num_genes: int, cells: Cells, fitness: FitnessCfg) -> None:
@@ -68,6 +71,7 @@ class Pool:
         self.iteration, self.number = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._next_number = 0
         self._crossings = np.zeros(0, np.int64)
+        self.chance, self.holds, self.labelled = np.zeros(0), np.zeros(0, bool), np.zeros(0, bool)
 
     def __len__(self) -> int:
         return len(self.number)
@@ -98,6 +102,8 @@ class Pool:
         self.number = np.append(self.number, self._next_number + np.arange(len(new)))
         self._crossings = np.append(self._crossings, np.ones(len(new), np.int64))
         self._next_number += len(new)
+        self.chance = np.append(self.chance, np.ones(len(new)))
+        self.holds, self.labelled = (np.append(each, np.zeros(len(new), bool)) for each in (self.holds, self.labelled))
         return merged
 
     def least_known(self, count: int, pending: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -107,7 +113,7 @@ class Pool:
         """
         if self.terrains is None or not len(self):
             return self.number[:0]
-        best_first = np.argsort(-expected_score(self.terrains, self.cells, self.fitness), kind="stable")
+        best_first = np.argsort(-self._find_score(self.terrains), kind="stable")
         rows, times = np.unique(np.searchsorted(self.number, pending), return_counts=True)
         crossings = self._crossings.copy()
         crossings[rows] += times
@@ -118,14 +124,19 @@ class Pool:
     def settle(self, pending: NDArray[np.int64]) -> NDArray[np.int64]:
         """Leaves each cell its best terrains, and those ``pending``; rows of the ones that hold a cell."""
         assert self.terrains is not None
-        score = expected_score(self.terrains, self.cells, self.fitness)
+        score = self._find_score(self.terrains)
         rank = _rank(self.terrains.cell, -score)
-        holds = (rank == 0) & (score > 0.0) & (self.terrains.fitness > FITNESS_FLOOR)
+        self.holds = (rank == 0) & (score > 0.0) & (self.terrains.fitness > FITNESS_FLOOR)
         stays = ((rank < DEPTH) & (score > 0.0)) | np.isin(self.number, pending)
         self.terrains = self.terrains.rows(stays)
-        for name in ("solutions", "iteration", "number", "_crossings"):
+        for name in ("solutions", "iteration", "number", "_crossings", "chance", "holds", "labelled"):
             setattr(self, name, getattr(self, name)[stays])
-        return np.flatnonzero(holds[stays])
+        return np.flatnonzero(self.holds)
+
+    def _find_score(self, terrains: Evaluation) -> NDArray[np.float64]:
+        """What each is expected to add to the QD score; less where nobody may cross it."""
+        score = expected_score(terrains, self.cells, self.fitness)
+        return score * (1.0 - self.fitness.crossed * (1.0 - self.chance))
 
 
 def _rank(group: NDArray[np.int64], key: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.int64]:

@@ -38,6 +38,12 @@ class SchedulerCfg(*_BASES):
         if self.settling >= iterations:
             raise ValueError(f"scheduler.settling must be below the iterations, {iterations}, got {self.settling}")
 
+    def check_crossed(self, crossed: float) -> None:
+        """Refuses that what nobody crosses earns less where no surrogate learns that, or no pool goes by it."""
+        if crossed and (self.methods != ("surrogate",) or not self.again):
+            rule = "fitness.crossed must be 0 unless the method is surrogate alone and scheduler.again 1 or more"
+            raise ValueError(f"{rule}, got {crossed:g} with {self.method} and {self.again}")
+
     @property
     def methods(self) -> tuple[str, ...]:
         """The methods joined in ``method``."""

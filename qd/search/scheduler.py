@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ribs.archives import GridArchive
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg
+from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, FitnessCfg
 from qd.search.methods import METHODS, Columns, Method, Setup
 from qd.search.pool import Pool
 from qd.search.presets import SchedulerCfg
@@ -59,7 +59,8 @@ class Scheduler:
         self.methods: list[Method] = []  # those that have emitters
         for first, name in enumerate(cfg.methods[: cfg.emitters]):
             numbers = tuple(range(first, cfg.emitters, len(cfg.methods)))
-            self.methods.append(METHODS[name](cfg, Setup(space, cells, self._archive, make_archive, seed, numbers)))
+            setup = Setup(space, cells, self._archive, make_archive, seed, numbers, fitness.crossed)
+            self.methods.append(METHODS[name](cfg, setup))
         self._pool = Pool(space.num_genes, cells, fitness) if cfg.again else None
         self._asked: list[Asked | None] = [None] * cfg.num_groups
 
@@ -126,6 +127,9 @@ class Scheduler:
             for name, values in self._archive.add(**{name: column[accepted] for name, column in rows.items()}).items():
                 added[name][accepted] = values
         if self._pool is not None and self._pool.terrains is not None:
+            if (surrogate := self._surrogate) is not None:
+                genes, goal_rate = clipped(self._pool.solutions), self._pool.terrains.goal_rate
+                self._pool.chance = surrogate.find_chance(genes, goal_rate)
             held = self._pool.settle(self._pending_numbers())  # the archive is made anew, of those that hold the cells
             self._archive.clear()
             if len(held):
@@ -138,6 +142,32 @@ class Scheduler:
         for method in self.methods:
             method.tell(evaluation, rows, added, batches)
         return num_new
+
+    @property
+    def _surrogate(self) -> Any:
+        """The surrogate that learns whether anybody crosses terrains; None where none does."""
+        surrogates: list[Any] = [getattr(method, "surrogate", None) for method in self.methods]
+        return next((each for each in surrogates if each is not None and each.crossed), None)
+
+    def ask_crossed(
+        self, most: int, rng: np.random.Generator
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
+        """Failing elites of which is to be found out whether anybody crosses them, at most so many, drawn at random.
+
+        Rows for :meth:`tell_crossed`, (T,), clipped genes, (T, num_genes), and goal rates, (T,).
+        """
+        assert self._pool is not None and self._pool.terrains is not None
+        pool, terrains = self._pool, self._pool.terrains
+        failing = terrains.valid & (terrains.goal_rate < FAILING_GOAL_RATE)
+        rows = np.sort(rng.permutation(np.flatnonzero(failing & pool.holds & ~pool.labelled))[:most])
+        return rows, clipped(pool.solutions[rows]), terrains.goal_rate[rows]
+
+    def tell_crossed(self, rows: NDArray[np.int64], crossed: NDArray[np.bool_]) -> None:
+        """Tells whether anybody crosses terrains of :meth:`ask_crossed`, which are not asked again, shape (T,)."""
+        assert self._pool is not None and self._pool.terrains is not None
+        self._pool.labelled[rows] = True
+        if len(rows):
+            self._surrogate.learn(self._pool.solutions[rows], self._pool.terrains.rows(rows), crossed)
 
     def elites(self) -> Columns:
         """The elites in order of descending fitness, as the arrays of an :class:`qd.search.archive.Archive`."""

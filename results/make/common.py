@@ -195,6 +195,12 @@ def follow_search(
     return [rows[iterations] for iterations in points]
 
 
+def origin_of(script: Script, run: Path) -> dict[str, Any]:
+    """Where and when a search that :func:`follow_search` follows was made."""
+    origin = script.read_so_far(run / CURVE_FILE)
+    return {key: origin[key] for key in ("commit", "device", "date")}
+
+
 def is_same_file(first: Path, second: Path) -> bool:
     """Whether two files exist and are equal."""
     return first.exists() and second.exists() and filecmp.cmp(first, second, shallow=False)
@@ -269,6 +275,12 @@ def mean_over_seeds(name: str, values: Sequence[float | None]) -> dict[str, Any]
         return {name: None, f"{name}_interval": None}
     numbers = np.asarray(values, np.float64)
     return {name: float(numbers.mean()), f"{name}_interval": t_interval(numbers)}
+
+
+def mean_counts(rows: Sequence[Mapping[str, Any]], counts: Sequence[str]) -> dict[str, Any]:
+    """Mean and interval of each count over searches that differ in their seeds, a row each."""
+    means = [mean_over_seeds(count, [row.get(count) for row in rows]) for count in counts]
+    return {name: value for mean in means for name, value in mean.items()}
 
 
 def read_made(file: Path) -> dict[str, Any]:

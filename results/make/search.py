@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from results.make import common
-from results.make.common import COUNTS, ONCE, PAPER_SIZE, Script, file_name, follow_search, mean_over_seeds, parse
+from results.make.common import COUNTS, ONCE, PAPER_SIZE, Script, file_name, follow_search, parse
 
 DEFAULT = "surrogate"
 LEARNING = ("cma_mae+map_elites", "cma_mae", "map_elites")
@@ -42,9 +42,7 @@ def follow(script: Script, method: str, seed: int) -> list[dict[str, Any]]:
     run = run_of(script, method, seed)
     points, stages = script.count_iterations(cfg, *STEPS), ("fresh", "resolved", "others")
     *rows, last = follow_search(script, run, cfg, points, COUNTS, stages)
-    origin = script.read_so_far(run / common.CURVE_FILE)
-    named = {"method": method, "search_seed": seed, **{key: origin[key] for key in ("commit", "device", "date")}}
-    return [*rows, named | last]
+    return [*rows, {"method": method, "search_seed": seed, **common.origin_of(script, run), **last}]
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
@@ -61,9 +59,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     numbers, searches = {}, list[dict[str, Any]]()
     for name, rows_of_seeds in rows.items():
         last = [rows_of_seed[-1] for rows_of_seed in rows_of_seeds]
-        numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(last)}
-        for count in COUNTS[1:]:
-            numbers[name] |= mean_over_seeds(count, [row.get(count) for row in last])
+        numbers[name] = {"episodes": last[0]["episodes"], "seeds": len(last)} | common.mean_counts(last, COUNTS[1:])
         numbers[name]["curve"] = [
             {count: float(np.mean([row[count] for row in rows_of_step])) for count in common.FRESH_COUNTS}
             for rows_of_step in zip(*rows_of_seeds, strict=True)

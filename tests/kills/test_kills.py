@@ -109,7 +109,7 @@ def bombs(target: Path) -> dict[str, bytes]:
     torch.save({"actor_state_dict": {"mlp.0.weight": bomb}, "format": "faultline training checkpoint 1"}, packed)
     np.savez(objects, allow_pickle=True, **{name: np.array([bomb], dtype=object) for name in ("key", "robot", "genes")})
     pickled = pickle.dumps(bomb)
-    search = b"faultline search checkpoint 6\n" + hashlib.sha256(pickled).digest() + pickled
+    search = b"faultline search checkpoint 7\n" + hashlib.sha256(pickled).digest() + pickled
     return {"pickle": pickled, "torch": packed.getvalue(), "search": search, "npz": objects.getvalue()}
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import FITNESS_FLOOR, Evaluation
+from qd.search.fitness import FITNESS_FLOOR, Evaluation, find_worth
 from qd.search.surrogate.networks import MEMBERS, Moments, Networks, Trainer
 from sim.controllers.loaders import on_stream, prepare_torch
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
@@ -31,7 +31,10 @@ _MIN_PENALTY = 0.01  # is added before the logarithm
 _RATIO_WEIGHT = 10.0  # cross entropies of ratios differ by hundredths, the other losses by tenths
 _NUM_RATES = 3  # goal rate, collision rate, collision bit
 _DRAWS = 4  # of the ratios of a terrain, for each network's fitness and collision
-_STORED = ("cfg", "cells", "space_name", "space_sha256", "squared_error", "_rng", "_genes", "_targets", "_scale")
+_LABELLED_SHARE = 0.25  # of each batch, drawn among the terrains of which is known whether anybody crosses them
+_STORED = (
+    "cfg", "cells", "crossed", "space_name", "space_sha256", "squared_error", "_rng", "_genes", "_targets", "_scale",
+)  # fmt: skip
 _ERROR_STEP = 0.1  # of the known error of ratios toward that of the latest terrains
 
 
@@ -44,11 +47,17 @@ class Prediction(NamedTuple):
     """Logarithms of the penalties' means and standard deviations, and the fitness' area hyperbolic sine."""
     rates: Tensor
     """Logits of goal rate, collision rate and collision bit."""
+    chance: Tensor
+    """That somebody crosses a terrain, shape (MEMBERS, N); 1 where the networks have not learned that."""
 
     @property
     def fitness(self) -> Tensor:
         """Shape (MEMBERS, N)."""
         return self.numbers[..., -1].sinh()
+
+    def worth(self, crossed: float) -> Tensor:
+        """What terrains are worth in the search, shape (MEMBERS, N)."""
+        return find_worth(self.fitness, self.chance, crossed)
 
     @property
     def collided(self) -> Tensor:
@@ -59,17 +68,22 @@ class Prediction(NamedTuple):
 class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
 
-    ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`.
+    ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`. With ``crossed``, which is that of
+    :class:`qd.search.fitness.FitnessCfg`, networks also learn whether anybody crosses a terrain.
     """
 
-    def __init__(self, cfg: Any, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence) -> None:
+    def __init__(
+        self, cfg: Any, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence, *, crossed: float = 0.0
+    ) -> None:
         self.cfg = cfg
         self.cells = cells
+        self.crossed = crossed
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
         self._genes = np.zeros((0, space.num_genes), np.int16)
         num_numbers = 2 * cells.num_ratios + 1
-        self._targets = np.zeros((0, cells.num_ratios + num_numbers + _NUM_RATES), np.float16)
+        num_targets = cells.num_ratios + num_numbers + _NUM_RATES + (crossed > 0.0)
+        self._targets = np.zeros((0, num_targets), np.float16)
         self._scale = np.stack([np.zeros(num_numbers), np.ones(num_numbers)]).astype(np.float32)
         self.squared_error: NDArray[np.float32] | None = None
         """Of predicted ratios, their episodes' noise included, shape (P,); None before the networks are asked."""
@@ -112,9 +126,25 @@ class Surrogate:
         with on_stream(self._stream):
             self._trainer = Trainer(self._networks.to(device), self._loss, device, moments)
 
-    def learn(self, genes: NDArray[np.float32], evaluation: Evaluation) -> None:
-        """Remembers the valid ones of terrains, (N, num_genes), and trains for their share of an iteration's steps."""
-        steps = max(1, round(self.cfg.training_steps * len(genes) / self.cfg.num_terrains))
+    @property
+    def _labelled(self) -> NDArray[np.int64]:
+        """Rows of the terrains of which is known whether anybody crosses them."""
+        return np.flatnonzero(~np.isnan(self._targets[:, -1])) if self.crossed else np.zeros(0, np.int64)
+
+    @property
+    def _knows_both(self) -> bool:
+        """Whether somebody crosses some of these, and nobody others."""
+        return len({*self._targets[self._labelled, -1].tolist()}) == 2
+
+    def learn(
+        self, genes: NDArray[np.float32], evaluation: Evaluation, crossed: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Remembers the valid ones of terrains, (N, num_genes), and trains for their share of an iteration's steps.
+
+        ``crossed`` says whether anybody crosses each, shape (N,), if that is known; then it trains for all the steps.
+        """
+        share = 1.0 if crossed is not None else len(genes) / self.cfg.num_terrains
+        steps = max(1, round(self.cfg.training_steps * share))
         valid = evaluation.valid
         genes = clipped(genes[valid])
         with on_stream(self._stream):
@@ -125,11 +155,19 @@ class Surrogate:
                 self.squared_error = before + np.float32(_ERROR_STEP) * (squared_error - before)
             if len(genes):
                 units = np.rint(genes * _GENE_UNITS).astype(np.int16)
-                self._genes = np.concatenate([self._genes, units])[-self._capacity :]
                 logarithms = (np.log(values + _MIN_PENALTY) for values in (evaluation.penalty_mean, evaluation.spread))
                 rates = evaluation.goal_rate, evaluation.collision_rate, evaluation.collides
-                targets = np.column_stack([evaluation.ratios, *logarithms, np.arcsinh(evaluation.fitness), *rates])
+                labels = np.full(len(valid), np.nan) if crossed is None else crossed.astype(np.float64)
+                columns = [*logarithms, np.arcsinh(evaluation.fitness), *rates, *[labels] * (self.crossed > 0.0)]
+                targets = np.column_stack([evaluation.ratios, *columns])
                 targets = targets[valid].astype(np.float32).astype(np.float16)
+                # Labels are few: their terrains come anew before they are the oldest ones, which are forgotten.
+                oldest = len(self) + len(units) + len(self._labelled) - self._capacity
+                again = self._labelled[self._labelled < oldest]
+                units = np.concatenate([self._genes[again], units])
+                targets = np.concatenate([self._targets[again], targets])
+                self._targets[again, -1] = np.nan
+                self._genes = np.concatenate([self._genes, units])[-self._capacity :]
                 self._targets = np.concatenate([self._targets, targets])[-self._capacity :]
                 self._num_unmapped = min(self._num_unmapped + len(units), len(self))
                 numbers = self._split(self._targets)[1].astype(np.float32)
@@ -157,28 +195,35 @@ class Surrogate:
             self._maps[chunk_rows] = self._map_genes(chunk / _GENE_UNITS).half()
         self._num_unmapped = 0
         middle, spread = torch.from_numpy(self._scale).to(self.device)
-        ratios, numbers, rates = self._split(torch.from_numpy(self._targets).to(self.device).float())
-        targets = torch.cat([ratios, (numbers - middle) / spread, rates], dim=-1)
+        ratios, numbers, *others = self._split(torch.from_numpy(self._targets).to(self.device).float())
+        targets = torch.cat([ratios, (numbers - middle) / spread, *others], dim=-1)
         shape = steps, min(BATCH, self.cfg.num_terrains), MEMBERS
-        drawn = torch.from_numpy(self._rng.integers(len(self), size=shape)).to(self.device)
+        terrains = self._rng.integers(len(self), size=shape)
+        if len(labelled := self._labelled):
+            size = steps, round(_LABELLED_SHARE * shape[1]), MEMBERS
+            terrains[:, : size[1]] = labelled[self._rng.integers(len(labelled), size=size)]
+        drawn = torch.from_numpy(terrains).to(self.device)
         turned = torch.from_numpy(self._rng.random(shape) < 0.5).to(self.device)  # terrain and robot are symmetric
         ordered = targets.new_empty(len(self._maps), targets.shape[1])
         ordered[rows] = targets
         self._trainer.run(self._maps, ordered, rows[drawn], turned)
 
-    def _split(self, columns: Any) -> tuple[Any, Any, Any]:
-        """Columns of ratios, numbers and rates."""
+    def _split(self, columns: Any) -> tuple[Any, Any, Any, Any]:
+        """Columns of ratios, numbers and rates, and the one of whether anybody crosses, if there is one."""
         first = self.cells.num_ratios
-        return columns[..., :first], columns[..., first:-_NUM_RATES], columns[..., -_NUM_RATES:]
+        last = 3 * first + 1
+        rates_end = last + _NUM_RATES
+        return columns[..., :first], columns[..., first:last], columns[..., last:rates_end], columns[..., rates_end:]
 
     def _loss(self, outputs: Tensor, targets: Tensor) -> Tensor:
         """Sum over the networks, none of which learns from another; both of shape (batch, MEMBERS, columns)."""
-        ratios, numbers, rates = self._split(outputs)
-        true_ratios, true_numbers, true_rates = self._split(targets)
+        ratios, numbers, rates, crossed = self._split(outputs)
+        true_ratios, true_numbers, true_rates, true_crossed = self._split(targets)
         loss = -_RATIO_WEIGHT * (true_ratios * ratios.log_softmax(-1)).sum(-1)
         loss = loss + ((numbers - true_numbers) ** 2).mean(-1)
         loss = loss + nn.functional.binary_cross_entropy_with_logits(rates, true_rates, reduction="none").mean(-1)
-        return loss.mean(0).sum()
+        loss = loss.mean(0).sum()
+        return loss + label_loss(crossed, true_crossed) if self.crossed else loss
 
     @torch.inference_mode()
     def predict(self, genes: Tensor) -> Prediction:
@@ -187,9 +232,20 @@ class Surrogate:
             torch.cuda.current_stream(self.device).wait_stream(self._stream)
         chunks = genes.split(_CHUNK[genes.device.type])
         columns = torch.cat([self._networks.judge(self._map_genes(chunk)) for chunk in chunks])
-        ratios, numbers, rates = self._split(columns.transpose(0, 1))
+        ratios, numbers, rates, crossed = self._split(columns.transpose(0, 1))
         middle, spread = torch.from_numpy(self._scale).to(self.device)
-        return Prediction(ratios.softmax(-1), numbers.clamp(-10.0, 10.0) * spread + middle, rates)
+        chance = crossed[..., 0].sigmoid() if self._knows_both else torch.ones_like(rates[..., 0])
+        return Prediction(ratios.softmax(-1), numbers.clamp(-10.0, 10.0) * spread + middle, rates, chance)
+
+    def find_chance(self, genes: NDArray[np.float32], goal_rate: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Chance that somebody crosses terrains, (N, num_genes), shape (N,): 1 where the goal was reached before."""
+        chance = np.ones(len(genes))
+        rows = np.flatnonzero(goal_rate == 0.0)
+        if self._knows_both and len(rows):
+            with on_stream(self._stream):
+                predicted = self.predict(torch.from_numpy(genes[rows]).to(self.device))
+                chance[rows] = predicted.chance.mean(0).cpu().numpy()
+        return chance
 
     @torch.inference_mode()
     def propose(
@@ -197,13 +253,14 @@ class Surrogate:
         count: int,
         elites: NDArray[np.float32],
         cell: NDArray[np.int64],
-        fitness: NDArray[np.float64],
+        worth: NDArray[np.float64],
         pending: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """Terrains for robots to cross: hard-random ones before there is an elite, varied elites before it has learned.
 
         Genes of the ``elites`` have shape (E, num_genes), and of ``pending`` terrains, which robots are to cross
-        already, (U, num_genes). Those proposed are in [-1, 1], (count, num_genes).
+        already, (U, num_genes). Those proposed are in [-1, 1], (count, num_genes). What elites are ``worth`` is their
+        fitness, or less (:func:`qd.search.fitness.find_worth`).
         """
         if not len(elites):
             return self.space.hard_random(count, self._rng)
@@ -214,14 +271,14 @@ class Surrogate:
                 return self._vary(parents, count, draw).cpu().numpy()
             explored = self._vary(parents, round(self.cfg.explore_share * count), draw)
             fittest = np.full(self.cells.num_cells, FITNESS_FLOOR, np.float32)
-            np.maximum.at(fittest, cell, fitness.astype(np.float32))
+            np.maximum.at(fittest, cell, worth.astype(np.float32))
             best = torch.from_numpy(fittest).to(self.device)
             expected = torch.cat([torch.from_numpy(pending).to(self.device), explored])
             if len(expected):  # what robots are to cross already
                 prediction = self.predict(expected)
                 cells = self._expected_cells(prediction)
                 inside = cells >= 0
-                best = best.scatter_reduce(0, cells[inside], prediction.fitness.mean(0)[inside], "amax")
+                best = best.scatter_reduce(0, cells[inside], prediction.worth(self.crossed).mean(0)[inside], "amax")
             searched = self._search(count - len(explored), parents, best, count, draw)
             return torch.cat([explored, searched]).cpu().numpy()
 
@@ -244,7 +301,8 @@ class Surrogate:
                 drawn = (ratios + error * noise).clamp_min(1e-6)
                 drawn = drawn / drawn.sum(-1, keepdim=True)
             reached = self.find_cells(drawn, prediction.collided)
-            added = torch.where(reached >= 0, (prediction.fitness - best[reached]).clamp_min(0.0), 0.0)
+            worth = prediction.worth(self.crossed)
+            added = torch.where(reached >= 0, (worth - best[reached]).clamp_min(0.0), 0.0)
             gain[children] = added.mean((0, 1))  # to the QD score
             spread[children] = prediction.ratios.std(0, correction=0).sum(1)
             cells[children] = self._expected_cells(prediction)
@@ -293,6 +351,14 @@ class Surrogate:
         for weights, tensors in zip(self._networks.parameters(), moments, strict=True):
             weights.data.copy_(tensors.pop("weights"))
         self._work_on("cpu", moments)
+
+
+def label_loss(logits: Tensor, labels: Tensor) -> Tensor:
+    """Sum over networks of the mean cross entropy of those labels that are not NaN, shape (batch, MEMBERS, columns)."""
+    known = ~labels.isnan()
+    weights, labels = known.to(logits.dtype), labels.nan_to_num()
+    entropy = nn.functional.binary_cross_entropy_with_logits(logits, labels, weights, reduction="none")
+    return (entropy.sum(0) / known.sum(0).clamp_min(1)).sum()
 
 
 def vary_elites(pool: Tensor, count: int, cfg: Any, genes_per_part: int | None, draw: torch.Generator) -> Tensor:

@@ -22,7 +22,7 @@ class Planted:
         self.robot = get_robot("anymal")
         self.asked, self.speeds = [], []
 
-    def cross(self, policy, terrains, *, replicas, engine="search", label, invalid_ok, progress=None):
+    def cross(self, policy, terrains, *, replicas, engine="search", label, invalid_ok, progress=None, room=0):
         self.asked.append((policy, engine, len(terrains), replicas, label, progress is not None))
         steering = terrains.steering
         if steering is None:  # plain crossings of measure_line

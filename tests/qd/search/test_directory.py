@@ -1,5 +1,6 @@
 import dataclasses
 import hashlib
+import json
 import os
 import pickle
 from pathlib import Path
@@ -128,7 +129,7 @@ KIND = b"faultline search checkpoint "
 
 def wrap(payload: bytes) -> bytes:
     """A file with a right magic and hash around any payload, as an attacker would make it."""
-    return KIND + b"6\n" + hashlib.sha256(payload).digest() + payload
+    return KIND + b"7\n" + hashlib.sha256(payload).digest() + payload
 
 
 @pytest.mark.parametrize(
@@ -264,6 +265,15 @@ def test_paper_has_the_papers_numbers():
     assert (cfg.fitness.alpha, cfg.fitness.lam, cfg.intervals) == (1.0, 2.0, 10)
 
 
+@pytest.mark.parametrize("scheduler", [{"method": "cma_mae"}, {"method": "surrogate+cma_mae"}, {"again": 0}])
+def test_only_a_surrogate_with_a_pool_learns_what_nobody_crosses(scheduler):
+    cfg = preset("wide", robot())
+    fitness = dataclasses.replace(cfg.fitness, crossed=0.5)
+    dataclasses.replace(cfg, fitness=fitness)
+    with pytest.raises(ValueError, match=r"fitness\.crossed"):
+        dataclasses.replace(cfg, fitness=fitness, scheduler=dataclasses.replace(cfg.scheduler, **scheduler))
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("method", "ppo"), ("method", "cma_me+cma_me"), ("disagree_share", 0.9), ("sigma0", 1e30)]
 )
@@ -286,6 +296,10 @@ def test_settings_survive_json_and_those_of_something_else_are_refused_by_name(t
     cfg = dataclasses.replace(cfg, scheduler=dataclasses.replace(cfg.scheduler, learning_rate=0.01, sigma0=0.5))
     write_run(tmp_path / "run", small_archive(), as_settings(cfg))
     assert RunDirectory(tmp_path / "run").read_cfg() == dataclasses.replace(cfg, iterations=7)
+    config = json.loads((tmp_path / "run/config.json").read_text())
+    del config["settings"]["fitness"]["crossed"]  # as in published ones, which are of 0
+    (tmp_path / "run/config.json").write_text(json.dumps(config))
+    assert RunDirectory(tmp_path / "run").read_cfg().fitness.crossed == 0.0
     write_run(tmp_path / "other", small_archive(), as_settings(cfg) | {"certified_by": []})
     with pytest.raises(ValueError, match="certified_by"):
         RunDirectory(tmp_path / "other").read_cfg()

@@ -7,7 +7,7 @@ import pytest
 
 from kernels.episode import Outcome
 from qd.search.descriptors import Cells, terrain_ratios
-from qd.search.fitness import FitnessCfg, evaluate_rollout, merge_evaluations
+from qd.search.fitness import FitnessCfg, evaluate_rollout, find_worth, merge_evaluations
 from tests.qd.stand_in import make_result
 
 CFG = FitnessCfg(penalties=("yaw_rate", "vel_x"), scales=(1.0, 10.0), alpha=0.5, lam=4.0)
@@ -34,6 +34,14 @@ def test_consistent_terrains_are_not_punished():
     collides = [np.arange(4) < collided for collided in (0, 1, 3, 4)]
     fitness = evaluate_rollout(make_result([[[1, 10]] * 4] * 4, base_collision=collides), CELLS, CFG).fitness
     assert fitness == pytest.approx([2.0, 2.0 - 4.0 * 0.75, 2.0 - 4.0 * 0.25, 2.0])
+
+
+def test_what_nobody_may_cross_is_worth_less_by_hand():
+    # Above the floor of -20 are 30, 30 and 8: the share .8 * (1 - chance) is lost, 0, .6 and .8.
+    worth = find_worth(np.array([10.0, 10.0, -12.0]), np.array([1.0, 0.25, 0.0]), 0.8)
+    assert worth == pytest.approx([10.0, -20.0 + 0.4 * 30.0, -20.0 + 0.2 * 8.0])
+    fitness = np.array([0.1, 0.2]) / 3.0
+    assert find_worth(fitness, np.zeros(2), 0.0).tolist() == fitness.tolist()
 
 
 @pytest.mark.parametrize(("num_invalid", "valid"), [(5, True), (6, False), (19, False)])

@@ -5,18 +5,22 @@ import json
 import os
 import re
 import shutil
+from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from qd.faults.judge import judge
+from qd.search import crossed as labels
 from qd.search import progress
 from qd.search.archive import read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint, save_checkpoint
 from qd.search.fitness import FitnessCfg, evaluate_rollout
 from qd.search.presets import SchedulerCfg
 from qd.search.progress import Bar
+from qd.search.surrogate import surrogate
 from qd.workers.compute import Compute
 from qd.workers.crosser import open_pipeline
 from qd.workers.invalid import AllInvalidError
@@ -214,6 +218,42 @@ def test_the_last_iterations_settle_what_was_found(tmp_path):
     assert archive.iteration.max() <= 4 and np.median(archive.episodes) > 8
     run(path, scheduler=AGAIN, iterations=10)  # begins with new terrains again
     assert [row["terrains"] for row in rows_of(path)][6:] == [12, 12, 0, 0]
+
+
+CROSSED = {
+    "scheduler": dataclasses.replace(CFG.scheduler, method="surrogate", batch_size=8, again=4, groups=2,
+                                     training_steps=2, candidates=2, generations=1),
+    "fitness": dataclasses.replace(CFG.fitness, crossed=0.8), "iterations": 4,
+}  # fmt: skip
+
+
+def partly_late(cfg, genes, seeds):
+    """Genes say where the controller passes, where those of the panel do, and where it does so steered."""
+    passes = {"C-G": genes[:, 8] > 0.2, "S": genes[:, 17] > 0.0}.get(Path(cfg.policy).stem, genes[:, 0] > 0.5)
+    passes = passes | (genes[:, 24] > 0.2) if cfg.with_steering else passes
+    penalties = stand_in.evaluate(genes, seeds, cfg.replicas).penalties
+    return stand_in.make_result(penalties, late=np.repeat(~passes[:, None], cfg.replicas, axis=1))
+
+
+def test_a_search_asks_who_crosses_what_stops_the_robot_and_goes_on_as_if_never_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(labels, "MOST", 6)
+    monkeypatch.setattr(surrogate, "BATCH", 4)
+    robots = Robots(partly_late)
+    run(tmp_path / "whole", **CROSSED, opener=robots)
+    rows = rows_of(tmp_path / "whole")
+    assert [row["labelled"] for row in rows] == [6, 6, 0, 6]
+    assert 0 < sum(row["labelled_crossed"] for row in rows) < 18
+    tried = Counter("steered" if cfg.with_steering else Path(cfg.policy).stem for cfg, _ in robots.crossed)
+    first, second, steered = (tried[name] for name in ("C-G", "S", "steered"))
+    assert 18 == first > second > steered > 0 and len(tried) == 4  # each tries what those before do not cross
+    assert sum(row["label_episodes"] for row in rows) == 4 * (first + second + steered)
+    assert sum(row["episodes"] for row in rows) == 4 * len(robots.crossed)
+    for count in (50, len(robots.crossed) - 3):  # in an iteration, and while the last ones are asked about
+        with pytest.raises(Interrupted, match="--resume"):
+            run(tmp_path / str(count), **CROSSED, opener=Robots(partly_late, stop_after=count))
+        run(tmp_path / str(count), **CROSSED, opener=Robots(partly_late))
+        assert rows_of(tmp_path / str(count)) == rows
+        assert (tmp_path / str(count) / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
 
 
 def test_a_search_ends_where_its_last_tenth_brings_little(tmp_path, capsys):

@@ -12,11 +12,12 @@ from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.search.presets import SchedulerCfg
 from qd.search.surrogate import surrogate as module
 from qd.search.surrogate.networks import MEMBERS, Networks, Trainer
-from qd.search.surrogate.surrogate import Surrogate, vary_elites
+from qd.search.surrogate.surrogate import Surrogate, label_loss, vary_elites
 from sim.terrains.corridor import SHAPE, corridor_heights
 from sim.terrains.spaces.base import clipped
 from sim.terrains.spaces.registry import get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
+from tests.builders import bump
 from tests.qd import stand_in
 from tests.sim.terrains.spaces.spaces import write_ridges
 
@@ -50,8 +51,8 @@ def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
     return {name: getattr(prediction, name).cpu().numpy().astype(float) for name in ("ratios", "fitness", "collided")}
 
 
-def make_surrogate(space=SUPER_GAUSSIAN, cells=CELLS, **settings) -> Surrogate:
-    return Surrogate(dataclasses.replace(CFG, **settings), cells, space, np.random.SeedSequence(0))
+def make_surrogate(space=SUPER_GAUSSIAN, cells=CELLS, weight=0.0, **settings) -> Surrogate:
+    return Surrogate(dataclasses.replace(CFG, **settings), cells, space, np.random.SeedSequence(0), crossed=weight)
 
 
 @pytest.fixture(scope="module")
@@ -256,6 +257,61 @@ def test_maps_take_no_more_room_than_terrains_need_and_each_stays_its_terrains(m
         terrain = torch.cdist(maps[rows].float().flatten(1), heights).argmin(1)  # genes of 16 bits move maps a little
         assert sorted(terrain.tolist()) == [*range(max(0, count - 300), count)]
         torch.testing.assert_close(targets[rows, :6].double(), ratios[terrain], rtol=0.0, atol=1e-3)
+
+
+def test_labels_that_nobody_knows_cost_nothing_by_hand():
+    unknown = float("nan")
+    logits = torch.tensor([[0.0, 9.0], [1.0, -2.0], [5.0, 9.0]])[..., None].requires_grad_()
+    labels = torch.tensor([[1.0, unknown], [0.0, 1.0], [unknown, unknown]])[..., None]
+    # Of the first network (ln 2 + ln(1 + e)) / 2, of the second ln(1 + e^2) of its only label.
+    loss = label_loss(logits, labels)
+    assert loss.item() == pytest.approx((np.log(2.0) + np.log(1.0 + np.e)) / 2.0 + np.log(1.0 + np.e**2.0), rel=1e-6)
+    loss.backward()
+    assert (logits.grad[..., 0] != 0.0).tolist() == [[True, False], [True, True], [False, False]]
+    assert label_loss(logits, torch.full_like(labels, unknown)).item() == 0.0
+
+
+def test_it_learns_who_crosses_from_a_few_labels_and_keeps_these(monkeypatch):
+    """Nobody crosses where a wall of .25 m lies in the middle; the newest 200 terrains are learned from."""
+    monkeypatch.setattr(module, "MAX_TERRAINS", 200)
+
+    def terrains(count, seed):
+        genes = SUPER_GAUSSIAN.hard_random(count, seed)
+        walls = np.random.default_rng(seed).random(count) < 0.5
+        genes[walls, :8] = bump(x=8.0, sigma_x=0.5, height=0.25)
+        return genes, ~walls
+
+    search = make_surrogate(weight=0.8, training_steps=150, batch_size=400)
+    genes, passes = terrains(60, 0)
+    others, others_pass = terrains(100, 1)
+    search.learn(others, crossed(others, 1))
+    search.learn(genes[passes], crossed(genes[passes], 0), passes[passes])
+    assert (search.find_chance(others, np.zeros(100)) == 1.0).all()  # labels of one kind say nothing
+    search.learn(genes[~passes], crossed(genes[~passes], 0), passes[~passes])
+    for seed in (2, 3):  # 300 more, without labels
+        more, _ = terrains(150, seed)
+        search.learn(more, crossed(more, seed))
+        search = pickle.loads(pickle.dumps(search))
+    assert len(search) == 200
+    chance = search.find_chance(others, np.zeros(100))
+    better = chance[others_pass, None] > chance[~others_pass]  # any two of them
+    assert better.mean() > 0.9 and chance[others_pass].mean() > chance[~others_pass].mean() + 0.2
+    assert (search.find_chance(others, np.full(100, 0.25)) == 1.0).all()  # by the episodes of its own
+
+
+def test_what_nobody_crosses_is_not_proposed_where_it_is_worth_nothing(learned, monkeypatch):
+    """By the first bump: nobody crosses a hollow. Half of the elites have one."""
+    search = pickle.loads(pickle.dumps(learned))
+    search.cfg = dataclasses.replace(CFG, explore_share=0.0, disagree_share=0.0)
+    by_bump = lambda genes: learned.predict(genes)._replace(chance=(genes[:, 7] > 0.0).float().expand(MEMBERS, -1))  # noqa: E731
+    monkeypatch.setattr(search, "predict", by_bump)
+    elites = SUPER_GAUSSIAN.hard_random(60, 0)
+    evaluation = crossed(elites, 0)
+    hollows = []
+    for search.crossed in (0.0, 1.0):
+        genes = search.propose(6, elites, evaluation.cell, np.full(60, -20.0), elites[:0])
+        hollows.append(int((genes[:, 7] <= 0.0).sum()))
+    assert hollows[0] > 0 == hollows[1]
 
 
 PAIR = torch.from_numpy(0.5 * SUPER_GAUSSIAN.uniform_random(2, 0))

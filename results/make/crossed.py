@@ -1,0 +1,71 @@
+"""Does a search find more faults where what nobody crosses earns less? Weights of ``--fitness.crossed``: crossed.json.
+
+Searches of preset wide differ in the weight alone. Those with a weight have an iteration less, which is more than their
+labels take. Their failing elites are crossed with contact resolved and by the robot's panel. Seed 20 chooses a weight,
+that of most distinct faults; the searches of other seeds, with it and without, are reported.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from results.make.common import COUNTS, Script, file_name, follow_search, mean_counts, origin_of, parse
+
+WEIGHTS = (0.0, 0.5, 0.8, 0.95)
+CHOOSING, SEEDS = 20, (21, 22, 23)
+"""Others than those of search.json and left.json."""
+EPISODES = 384_000
+STAGES = ("fresh", "resolved", "others")
+SHARE = "uncrossed_share"
+"""Share of the failing elites that no controller of the panel crosses."""
+COMPARED = (*COUNTS, SHARE)
+
+
+def name_part(weight: float, seed: int) -> str:
+    """A search by its weight and seed."""
+    return f"{weight:g}, seed {seed}"
+
+
+def follow(script: Script, weight: float, seed: int) -> dict[str, Any]:
+    """Counts of a search with their origin, searched and judged where today's sources have not."""
+    cfg = script.search_cfg(seed=seed, **({"again": 2} if script.small else {}))
+    (iterations,) = script.count_iterations(cfg, EPISODES)
+    cfg = replace(cfg, fitness=replace(cfg.fitness, crossed=weight))
+    run = script.runs / "crossed" / file_name(name_part(weight, seed))
+    (counts,) = follow_search(script, run, cfg, [max(1, iterations - (weight > 0.0))], COUNTS, STAGES)
+    failing, certified = counts["failing"], counts["certified"]
+    share = 1.0 - certified / failing if failing and certified is not None else None
+    return {"weight": weight, "search_seed": seed, **origin_of(script, run), **counts, SHARE: share}
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Chooses a weight, and writes means of it and of 0 with 95 % t intervals over seeds; parts are searches alone."""
+    searches = {name_part(weight, seed): (weight, seed) for seed in (CHOOSING, *SEEDS) for weight in WEIGHTS}
+    script = parse(__doc__, argv, "crossed.json", parts=tuple(searches))
+    for part in script.parts:
+        follow(script, *searches[part])
+    if script.parts:
+        return {}
+    first = [follow(script, weight, CHOOSING) for weight in WEIGHTS]
+    chosen = max(first[1:], key=lambda row: row["faults_distinct"] or 0)["weight"]
+    seeds = SEEDS[:1] if script.small else SEEDS
+    without, with_it = ([follow(script, weight, seed) for seed in seeds] for weight in (0.0, chosen))
+    numbers = {
+        f"{rows[0]['weight']:g}": {"seeds": len(rows)} | mean_counts(rows, COMPARED) for rows in (without, with_it)
+    }
+    differences = [
+        {name: None if None in (a[name], b[name]) else b[name] - a[name] for name in COMPARED}
+        for a, b in zip(without, with_it, strict=True)
+    ]
+    return script.write(
+        {
+            "chosen": chosen,
+            "weights": numbers,
+            "difference": mean_counts(differences, COMPARED),
+            "searches": [*first, *without, *with_it],
+        }
+    )
+
+
+if __name__ == "__main__":
+    main()
