@@ -26,8 +26,8 @@ from tests.qd.stand_in import Stub, make_result, result_of
 
 MAKE = Path(common.__file__).parent
 SCRIPTS = (
-    "base", "conditions", "crossed", "dose", "left", "minimal", "pack", "penalty_ratios", "search", "search_noise",
-    "spaces", "speed", "tables",
+    "agreement", "base", "conditions", "crossed", "dose", "left", "minimal", "pack", "penalty_ratios", "search",
+    "search_noise", "spaces", "speed", "tables", "witness",
 )  # fmt: skip
 """Those that call all that the others call."""
 FILES = {name: f"{name}.json" for name in SCRIPTS} | {"minimal": "archive/minimal.json", "pack": "pack/pack.json"}
