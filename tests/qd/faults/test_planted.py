@@ -19,7 +19,7 @@ Y, X = SPACING * np.indices((NUM_ROWS, NUM_COLS))
 HEIGHTS = {
     "wall": np.where((X > 5.0) & (X < 5.5), 1.0, 0.0),
     "ditch": np.where((X > 5.0) & (X < 6.2) & ~((Y > 5.4) & (Y < 7.0)), -1.0, 0.0),  # a bridge 2 m to the left
-    "kerb": np.where(X > 5.0, 0.08, 0.0),
+    "kerb": np.where(X > 5.5, 0.08, 0.0),  # in the middle of a segment
     "level": np.zeros_like(X),
 }
 """Heights [m] by what is planted, over the full width."""
@@ -77,12 +77,12 @@ def seek(names: list[str], walker: type[Walker], **settings: Any) -> Witnesses:
 def test_a_wall_has_no_way_a_bridge_leads_around_and_a_kerb_is_crossed_slowly_on_the_line():
     names = ["wall", "ditch", "kerb"]
     spread = {"speed_std": 0.3, "offset_std": 0.25, "heading_std": 0.3}
-    witnesses = seek(names, Hasty, generations=4, samples=12, best=3, **spread)
+    witnesses = seek(names, Hasty, generations=6, samples=12, best=2, step=1.0, **spread)
     words = dict(zip(names, [WITNESSES[kind] for kind in witnesses.kind], strict=True))
     assert words == {"wall": "", "ditch": "around", "kerb": "line"}
     assert not witnesses.counts[0, ..., :3].any() and not witnesses.counts[:, :, 0, :3].any()  # nobody without a way
-    (_, ditch, kerb), at = witnesses.way, 2  # segment from x = 4 to 5 m, whose place is 1 m ahead
-    assert 1.2 < ditch[at, 1] < 3.2 and kerb[at, 0] < 0.55
+    _, ditch, kerb = witnesses.way  # at x = 4 to 5 m the place is 1 m ahead, and the kerb lies at 5 to 6 m
+    assert 1.2 < ditch[2, 1] < 3.2 and kerb[3, 0] < 0.55
 
 
 @pytest.mark.slow
