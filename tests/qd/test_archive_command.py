@@ -92,6 +92,7 @@ def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, m
     monkeypatch.setattr(loop, "ensure_ready", lambda *given: pytest.fail("they are looked at"))
     for again, settling, name in (("2", "1", "settling"), ("10001", "0", "again")):
         assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
+    assert "fitness.crossed" in fails(capsys, *TINY, "--fitness.crossed", ".5")
     assert os.listdir() == []
 
 

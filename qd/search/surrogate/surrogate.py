@@ -162,8 +162,8 @@ class Surrogate:
                 targets = np.column_stack([evaluation.ratios, *columns])
                 targets = targets[valid].astype(np.float32).astype(np.float16)
                 # Labels are few: their terrains come anew before they are the oldest ones, which are forgotten.
-                oldest = len(self) + len(units) + len(self._labelled) - self._capacity
-                again = self._labelled[self._labelled < oldest]
+                labelled = self._labelled
+                again = labelled[labelled < len(self) + len(units) + len(labelled) - self._capacity]
                 units = np.concatenate([self._genes[again], units])
                 targets = np.concatenate([self._targets[again], targets])
                 self._targets[again, -1] = np.nan
