@@ -137,7 +137,7 @@ def build_simulator(cfg: PipelineCfg, num_terrains: int) -> Simulator:
     if cfg.engine in ("resolved", "mujoco_c"):
         robot, solver = resolved(robot)
     if cfg.on_mujoco_c:
-        return MujocoC(robot, cfg.policy, replicas=cfg.replicas, solver=solver, device=cfg.compute.device)
+        return MujocoC(robot, cfg.policy, replicas=cfg.replicas, solver=solver)
     import sim.simulation  # noqa: F401  Newton keeps the frames that first import it, and a simulation in them
 
     rollout = Rollout(

@@ -49,19 +49,19 @@ def _base_com(robot: RobotCfg) -> Array:
     return robot_spec(robot).compile().body_ipos[1].copy()
 
 
-def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int, device: str) -> Starts:
+def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count: int) -> Starts:
     """The starts that :class:`sim.rollout.Rollout` gives to replicas 0 to ``count - 1`` of a terrain with this seed.
 
-    ``heights`` [m] have the shape (nrow, ncol); ``device`` is a Warp device.
+    ``heights`` [m] have the shape (nrow, ncol). The CPU draws them: each of many processes would hold memory of a GPU.
     """
-    bank = TerrainBank(1, device=device)
+    bank = TerrainBank(1, device="cpu")
     bank.set_heights(heights[None])
     base_com = _base_com(robot)
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice("cpu"):
         sensors = make_struct(Sensors, default_joint_pos=wp.array(robot.default_joint_pos, dtype=float))
         widths = {"joint_q": 7, "joint_qd": 6, "action": 0}
         shapes = {name: (count, width + robot.num_joints) for name, width in widths.items()}
-        step = make_zeros(RobotStep, device, **shapes)
+        step = make_zeros(RobotStep, "cpu", **shapes)
         step.base_com = base_com
         episodes = make_episodes(count)
         signed = int(np.uint32(seed).astype(np.int32))  # as a kernel takes it
@@ -229,19 +229,13 @@ _CHUNK = 25  # episodes at a time: enough for the policy's batch
 class MujocoC:
     """Crosses terrains in plain MuJoCo C, from the starts that a rollout of their seeds has (:class:`Rollout`)."""
 
-    def __init__(
-        self, robot: RobotCfg, policy: str, *, replicas: int, solver: SolverCfg | None = None, device: str = "cpu"
-    ) -> None:
-        """The first of ``replicas`` episodes a terrain begin as a rollout's do, which may have fewer.
-
-        The Warp ``device`` makes the terrains and draws the starts.
-        """
+    def __init__(self, robot: RobotCfg, policy: str, *, replicas: int, solver: SolverCfg | None = None) -> None:
+        """The first of ``replicas`` episodes a terrain begin as a rollout's do, which may have fewer."""
         prepare_torch("cpu")
         self._robot = robot
         self._policy = load_policy(policy, robot, "cpu")
         self._replicas = replicas
         self._time_constant_s = (solver or SolverCfg()).time_constant_s
-        self._device = device
         self._pending: deque[Terrains] = deque()
 
     def put(self, terrains: Terrains) -> None:
@@ -259,10 +253,10 @@ class MujocoC:
         terrains = self._pending.popleft()
         heights, ground = terrains.heights, terrains.ground
         if heights is None:
-            heights, ground = make_terrains(terrains.values, terrains.space, device=self._device)
+            heights, ground = make_terrains(terrains.values, terrains.space, device="cpu")
         results = []
         for index, (grid, seed) in enumerate(zip(heights, terrains.seeds, strict=True)):
-            starts = draw_starts(self._robot, grid, int(seed), self._replicas, self._device)
+            starts = draw_starts(self._robot, grid, int(seed), self._replicas)
             maps = None if ground is None else ground[index : index + 1]
             how: dict[str, Any] = {"time_constant_s": self._time_constant_s, "ground": maps}
             crossed = []

@@ -360,7 +360,7 @@ def test_it_learns_goes_on_and_crosses(dog, tmp_path, capsys):
     torch.testing.assert_close(copy.network(rows), after.network(rows))
     flat = np.zeros((NUM_ROWS, NUM_COLS), np.float32)
     brief = replace(dog, max_duration_s=0.2)
-    assert not cross_in_mujoco_c(brief, after, flat, draw_starts(brief, flat, 2, 3, "cpu")).invalid.any()
+    assert not cross_in_mujoco_c(brief, after, flat, draw_starts(brief, flat, 2, 3)).invalid.any()
     (tmp_path / "further").mkdir()
     # As a hardening does: with its critic.
     further = begun(dog, dog_cfg(dog, policy=str(run / "checkpoint.pt")), tmp_path / "further")

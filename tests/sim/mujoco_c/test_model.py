@@ -32,7 +32,7 @@ def test_starts_are_those_of_the_rollout(robot):
     sim = rollout.sim
     expected = Starts.of_newton(sim.joint_q.numpy(), sim.joint_qd.numpy(), np.array(sim.base_com))
     # Asking for more episodes does not change the first.
-    starts = draw_starts(robot, sim.bank.heights.numpy()[0], 77, EPISODES + 4, "cpu")
+    starts = draw_starts(robot, sim.bank.heights.numpy()[0], 77, EPISODES + 4)
     np.testing.assert_array_equal(starts.qpos[:EPISODES], expected.qpos)
     np.testing.assert_array_equal(starts.qvel[:EPISODES], expected.qvel)
 
@@ -92,7 +92,7 @@ def test_moving_on_a_plane_is_the_same_motion_in_both(robot, changes, time_const
     shipped, robot, solver = robot, dataclasses.replace(robot, **changes), SolverCfg(time_constant_s=time_constant_s)
     rollout = Rollout(robot, policy, num_terrains=1, replicas=EPISODES, device="cpu", solver=solver)
     rollout.put(Terrains(heights=FLAT[None], seeds=np.array([1000], np.uint32)))
-    starts = draw_starts(robot, FLAT, 1000, EPISODES, "cpu")
+    starts = draw_starts(robot, FLAT, 1000, EPISODES)
     plain, result = cross_and_keep(robot, policy, FLAT, starts, seconds, time_constant_s=time_constant_s)
     for _ in range(round(seconds / robot.control_dt)):
         rollout.control_step()
@@ -118,7 +118,7 @@ def test_a_robot_senses_the_same_in_both(anymal):
     for _ in range(2):  # robots that begin anew feel nothing of the episode before
         rows.clear()
         rollout.evaluate(Terrains(heights=FLAT[None], seeds=np.array([1000], np.uint32)))
-    ours, starts = [read_row(row, robot) for row in rows[:10]], draw_starts(robot, FLAT, 1000, EPISODES, "cpu")
+    ours, starts = [read_row(row, robot) for row in rows[:10]], draw_starts(robot, FLAT, 1000, EPISODES)
     rows.clear()
     cross_in_mujoco_c(robot, keep, FLAT, starts)
     plain = [read_row(row, robot) for row in rows[:10]]
@@ -182,7 +182,7 @@ def test_a_target_counts_after_the_delay_in_both(tmp_path, device):
 def test_what_ends_a_crossing(robot):
     heights = FLAT.copy()
     heights[0, 0] = 0.01  # or the ground were a plane, which would push off legs that are half a metre deep in it
-    starts = draw_starts(robot, FLAT, 5, 4, "cpu")
+    starts = draw_starts(robot, FLAT, 5, 4)
     starts.qpos[0, :2] = 13.7, 4.0  # at the goal
     starts.qpos[1, 1] = 10.5  # outside
     starts.qpos[2, 2] = 0.05  # its belly in the ground
@@ -204,13 +204,13 @@ def test_terrains_come_back_in_order_and_each_episode_is_what_its_start_alone_ma
     result = simulator.take()
     assert result.outcome.shape == (2, 26) and result.penalties.shape == (2, 26, len(cassie.penalties))
     for index, heights in enumerate(grids):
-        expected = cross_in_mujoco_c(cassie, stand, heights, draw_starts(cassie, heights, 3 + index, 26, "cpu")[25:])
+        expected = cross_in_mujoco_c(cassie, stand, heights, draw_starts(cassie, heights, 3 + index, 26)[25:])
         np.testing.assert_array_equal(result.duration_s[index, 25:], expected.duration_s[0])
         np.testing.assert_array_equal(result.penalties[index, 25:], expected.penalties[0])
 
 
 def test_a_controller_with_a_memory_is_always_asked_for_all_robots(anymal):
-    starts = draw_starts(anymal, FLAT, 5, 3, "cpu")
+    starts = draw_starts(anymal, FLAT, 5, 3)
     starts.qpos[0, :2] = 13.7, 4.0  # at the goal: it ends at once
     policy, robot = Remembers(), dataclasses.replace(anymal, max_duration_s=0.1)
     result = cross_in_mujoco_c(robot, policy, FLAT, starts)

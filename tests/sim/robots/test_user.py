@@ -110,7 +110,7 @@ def test_a_blind_robot_crosses_in_both_simulators(tmp_path, device):
     flat = Terrains(heights=FLAT[None], seeds=np.array([1]))
     assert crossing(dog, device, hold).evaluate(flat).outcome.tolist() == [[Outcome.TIME_OUT] * 4]
     short = dataclasses.replace(dog, max_duration_s=0.1)
-    result = cross_in_mujoco_c(short, hold, FLAT, draw_starts(short, FLAT, 1, 2, "cpu"))
+    result = cross_in_mujoco_c(short, hold, FLAT, draw_starts(short, FLAT, 1, 2))
     assert result.outcome.tolist() == [[Outcome.TIME_OUT] * 2]
 
 

@@ -74,7 +74,7 @@ def test_moving_under_a_condition_is_the_same_motion_as_in_mujoco_c(anymal, shar
     for _ in range(round(seconds / anymal.control_dt)):
         shared.control_step()
     ours = shared.sim.joint_q.numpy()[order]
-    starts = draw_starts(anymal, heights, 1000, EPISODES, "cpu")
+    starts = draw_starts(anymal, heights, 1000, EPISODES)
     grounds = map(under, (conditions, nominal_row()))
     crossed = [cross_and_keep(anymal, anymal.policy_file, heights, starts, seconds, ground=at) for at in grounds]
     plain, nominal = (episodes.qpos for episodes, *_ in crossed)

@@ -229,7 +229,7 @@ def test_walking_over_patches_costs_the_same_in_both(anymal):
     rollout = Rollout(robot, anymal.policy_file, **sizes, with_ground=True)
     flat = [Terrains(heights=FLAT[None], seeds=np.array([5]), ground=maps) for maps in (ground, None)]
     ours, on_plain = map(rollout.evaluate, flat)
-    starts = draw_starts(anymal, FLAT, 5, episodes, "cpu")
+    starts = draw_starts(anymal, FLAT, 5, episodes)
     plain = cross_in_mujoco_c(robot, load_policy(anymal.policy_file, anymal, "cpu"), FLAT, starts, ground=ground)
     assert (ours.outcome == plain.outcome).all() and (plain.outcome == Outcome.TIME_OUT).all()
     assert ours.final_position[0, :, 0].min() > 4.5  # over two boundaries
