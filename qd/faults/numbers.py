@@ -242,9 +242,9 @@ def describe_way(way: NDArray[np.float32]) -> str:
     slow, aside = int(speed.argmin()), int(np.abs(offset).argmax())
     places = [f"from x = {ends[k]:.0f} to {ends[k + 1]:.0f} m" for k in (slow, aside + 1)]  # an offset is for ahead
     is_even = speed.max() - speed.min() < 0.15
-    words = f"at {speed.mean():.1f} m/s" if is_even else f"slowed to {speed[slow]:.1f} m/s {places[0]}"
+    words = f"at {np.median(speed):.1f} m/s{'' if is_even else f', slowed to {speed[slow]:.1f} m/s {places[0]},'}"
     side = f"{abs(offset[aside]):.1f} m to the {'left' if offset[aside] > 0 else 'right'} {places[1]}"
-    return f"{words} and {side}" if abs(offset[aside]) >= 0.05 else words
+    return f"{words} and {side}" if abs(offset[aside]) >= 0.05 else words.rstrip(",")
 
 
 def fresh_counts(archive: Archive, number: int) -> NDArray[np.int64]:

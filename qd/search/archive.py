@@ -298,6 +298,7 @@ _TABLES: dict[str, tuple[type[Table], dict[str, tuple[str, str]]]] = {
 _BY_JUDGING = (_GROUPED, _CROSSED, *(dict(columns.values()) for _, columns in _TABLES.values()))  # whole, or not at all
 _TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause", "witness_walker"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
+_WHOLE = {name for name in _SHAPES if name.endswith(("outcomes", "counts", "kind", "cell", "family", "iteration"))}
 _FINITE = ("genes", "fitness", "scales", "witness_way", "witness_limit_m")
 
 
@@ -329,7 +330,8 @@ def read_archive(path: str | Path) -> Archive:
         sizes = {"2": 2, "3": len(STEERING), "4": len(OUTCOMES), "S": SEGMENTS}
         check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
         for name, array in arrays.items():
-            kinds, content = ("U", "texts") if name in _TEXTS else ("bif", "numbers")
+            kinds, content = ("i", "whole numbers") if name in _WHOLE else ("bif", "numbers")
+            kinds, content = ("U", "texts") if name in _TEXTS else (kinds, content)
             if array.dtype.kind not in kinds:
                 raise ValueError(f"{name} must hold {content}, got {array.dtype}")
             if name in _FINITE and not np.isfinite(array).all():

@@ -136,10 +136,11 @@ def test_the_line_is_as_wide_as_plain_crossings_need():
 
 def test_ways_in_words():
     way = np.zeros((SEGMENTS, 3), np.float32)
-    way[:, 0] = 0.75
+    way[:, 0] = 0.8
     way[5, 0], way[4, 1], way[-1, 1] = 0.4, -0.3, 2.0  # in the last segment the robot is sent to the goal all the same
-    assert describe_way(way) == "slowed to 0.4 m/s from x = 7 to 8 m and 0.3 m to the right from x = 7 to 8 m"
+    slowed = "at 0.8 m/s, slowed to 0.4 m/s from x = 7 to 8 m"
+    assert describe_way(way) == f"{slowed}, and 0.3 m to the right from x = 7 to 8 m"
     way[:, 1] = 0
-    assert describe_way(way) == "slowed to 0.4 m/s from x = 7 to 8 m"
+    assert describe_way(way) == slowed
     way[:, 0] = np.linspace(0.9, 1.0, SEGMENTS)
     assert describe_way(way) == "at 0.9 m/s"

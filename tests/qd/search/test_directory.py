@@ -213,6 +213,7 @@ def test_corrected_elites_are_in_order_of_fresh_fitness_and_the_invalid_last():
         ("fitness", np.full(5, np.nan)),
         ("witness_counts", None),
         ("witness_kind", np.array([0, 3, 0, 4, 0])),
+        ("witness_kind", np.array([0.0, 3.0, 0.0, 1.5, 0.0])),
         ("witness_way", np.zeros((5, 11, 3), np.float32)),
         ("witness_way", np.full((5, 12, 3), np.nan, np.float32)),
     ],
