@@ -246,8 +246,8 @@ def test_a_search_asks_who_crosses_what_stops_the_robot_and_goes_on_as_if_never_
     tried = Counter("steered" if cfg.with_steering else Path(cfg.policy).stem for cfg, _ in robots.crossed)
     first, second, steered = (tried[name] for name in ("C-G", "S", "steered"))
     assert 18 == first > second > steered > 0 and len(tried) == 4  # each tries what those before do not cross
-    assert sum(row["label_episodes"] for row in rows) == 4 * (first + second + steered)
-    assert sum(row["episodes"] for row in rows) == 4 * len(robots.crossed)
+    assert sum(row["label_episodes"] for row in rows) == 4 * (first + second) + 8 * steered
+    assert sum(row["episodes"] for row in rows) == 4 * (len(robots.crossed) + steered)
     for count in (50, len(robots.crossed) - 3):  # in an iteration, and while the last ones are asked about
         with pytest.raises(Interrupted, match="--resume"):
             run(tmp_path / str(count), **CROSSED, opener=Robots(partly_late, stop_after=count))
