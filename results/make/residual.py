@@ -1,14 +1,13 @@
 """Do small offsets of joint targets lead over terrains that no command leads over? residual.json.
 
-Of the published archive's confirmed elites that no controller and no witness crosses, ``--terrains`` are drawn at
-random. The command stays plain. At most 0.3 rad are added to the joint targets that the controller asks for: by a
-``spline`` of each joint over the way to the goal, or, as a ``gait``, by splines times 1, sine and cosine of a phase
-whose frequency is searched, too. A cross-entropy search (qd/faults/steer.py) looks for them, on the straight line: else
-most of what it finds are legs that lead around, as commands do. Fresh episodes with and without offsets test what it
-finds, as they test witnesses.
+Of the published archive's confirmed elites that no controller crosses, nor any on the line where it is steered, 500 are
+drawn at random. The command stays plain. At most 0.3 rad are added to the joint targets that the controller asks for:
+by a ``spline`` of each joint over the way to the goal, or, as a ``gait``, by splines times 1, sine and cosine of a
+phase whose frequency is searched, too. A cross-entropy search (qd/faults/steer.py) looks for them, on the straight
+line: else most of what it finds are legs that lead around, as commands do. Fresh episodes with and without offsets test
+what it finds, as they test witnesses.
 """
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -23,7 +22,7 @@ from qd.evaluate.sets import read_space
 from qd.faults.judge import elite_seeds
 from qd.faults.numbers import EPISODES
 from qd.faults.steer import LINE_M, SteerCfg, count_goals, find_kinds, mix_segments, move_to_best, score_ways
-from qd.search.archive import WITNESSES, Archive
+from qd.search.archive import WITNESSES
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.seeds import Stream
 from results.make.common import Script, parse
@@ -34,6 +33,7 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout, RolloutResult
 from sim.terrains.terrains import Terrains
 
+TERRAINS = 500
 KNOTS = 6
 """Of a spline, at equal distances from start to goal."""
 LARGEST = 0.3
@@ -158,14 +158,6 @@ def seek_offsets(
     return mean.astype(np.float32), curve
 
 
-def find_open(archive: Archive) -> NDArray[np.int64]:
-    """Rows of confirmed elites that no controller crosses, nor a witness if these were looked for."""
-    is_open = archive.confirmed & ~archive.certified_by_controllers
-    if archive.witnesses is not None:
-        is_open &= (archive.witnesses.walker != "") & (archive.witnesses.kind == 0)
-    return np.flatnonzero(is_open)
-
-
 def measure(
     script: Script, terrains: Terrains, seeds: NDArray[np.uint32], splines: int, limit_m: float, cfg: SteerCfg
 ) -> tuple[dict[str, Any], NDArray[np.int64]]:
@@ -203,16 +195,13 @@ def cross_half(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Searches offsets of both forms on the same terrains."""
-    parser = argparse.ArgumentParser(add_help=False)
-    parser.add_argument("--terrains", type=int, default=500)
-    args, others = parser.parse_known_args(argv)
-    script = parse(__doc__, others, "residual.json")
+    script = parse(__doc__, argv, "residual.json")
     sizes = {"generations": 2, "samples": 4, "best": 2} if script.small else {"samples": 32}
     cfg = SteerCfg(least_std=0.02, **sizes)
     archive = script.read_archive()
-    is_open = find_open(archive)
+    is_open = np.flatnonzero(archive.confirmed & ~archive.certified)
     rng = np.random.default_rng([script.seed, Stream.RESIDUAL])
-    count = min(2 if script.small else args.terrains, len(is_open))
+    count = min(2 if script.small else TERRAINS, len(is_open))
     rows = np.sort(rng.choice(is_open, count, replace=False))
     times = cfg.generations + 2
     seeds = elite_seeds(archive, script.seed, times, stream=Stream.RESIDUAL).reshape(-1, times)[rows]

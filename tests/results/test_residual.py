@@ -9,10 +9,9 @@ import torch
 from kernels.episode import Outcome
 from qd.faults.steer import SteerCfg
 from results.make import residual
-from results.make.residual import OffsetPolicy, cross_half, find_offsets, find_open, seek_offsets
+from results.make.residual import OffsetPolicy, cross_half, find_offsets, seek_offsets
 from sim.controllers.runner import Memory, find_memory
 from sim.robots.find import get_robot
-from tests.builders import judged_archive
 from tests.qd.stand_in import result_of
 
 JOINTS = 2
@@ -99,7 +98,3 @@ def test_half_of_the_valid_episodes_must_cross():
     assert cross_half(np.array([[9, 10, 20, 20], [9, 9, 9, 18], [0, 0, 0, 0]])).tolist() == [
         [False, True, True], [True, True, True], [False, False, False],
     ]  # fmt: skip
-
-
-def test_open_are_confirmed_elites_that_no_controller_crosses():
-    assert find_open(judged_archive()).tolist() == [1]
