@@ -73,9 +73,9 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     lam: Annotated[float, tyro.conf.arg(name="fitness.lam")] = 2.0
     """Weight of u in the fitness, the share of episodes without base collision; u is 0 if none collided."""
     crossed: Annotated[Share, tyro.conf.arg(name="fitness.crossed")] = 0.0
-    """How much less, in the search, a terrain is worth that nobody crosses, neither the robot's panel nor, slower or a
-    little aside, the controller itself. Networks learn that from some failing elites; the fitness stays what it is.
-    Only with --method surrogate and --scheduler.again."""
+    """Share by which the search lowers the worth of terrains that nobody crosses: neither the robot's panel nor, at
+    other speeds and a little aside, the controller itself. Networks learn which from some failing elites; the fitness
+    stays what it is. Only with --method surrogate and --scheduler.again."""
     intervals: Annotated[int, tyro.conf.arg(name="fitness.intervals")] = 10
     """Intervals of each ratio."""
 
@@ -117,9 +117,9 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         from sim.terrains.spaces.registry import load_space
 
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
-        compute = _compute(self)
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
         scheduler.check_crossed(self.crossed)
+        compute = _compute(self)
         if self.resume is None:
             policy = None
             flags: dict[str, Any] = {"size": self.preset, "height": self.height, "compute": compute}

@@ -243,13 +243,15 @@ class Steered(Stage):
         seeds = elite_seeds(archive, search.cfg.seed, times, stream=Stream.STEERED).reshape(-1, times)[rows]
         level = at_height(SUPER_GAUSSIAN, MAX_HEIGHT * search.space.height_share)
         plain = plain_set("hard_random", _LINE_TERRAINS, search.cfg.seed, level, "validation").terrains
-        limit_m = measure_line(crosser, search.policy, plain, judging.step)
+        before = archive.witnesses
+        tried = before is not None and (before.walker != "").any()  # their kinds are by that limit
+        limit_m = before.limit_m if before and tried else measure_line(crosser, search.policy, plain, judging.step)
         rng = np.random.default_rng(np.random.SeedSequence([search.cfg.seed], spawn_key=(Stream.STEERED,)))
         some = seek_witnesses(crosser, walkers, terrains, seeds, limit_m, rng=rng, label=judging.step, cfg=cfg)
         found = [f"{(some.kind == kind).sum()} {words}" for kind, words in _WITNESS_WORDS.items()]
         print(f"Steered, robots cross {', '.join(found)}, of {len(rows)} terrains not certified before.", flush=True)
-        before = archive.witnesses or no_witnesses(len(archive), limit_m)
-        witnesses = replace(before.updated(rows, some), limit_m=limit_m)
+        before = before if before and tried else no_witnesses(len(archive), limit_m)
+        witnesses = before.updated(rows, some)
         mujoco_c = archive.mujoco_c if np.array_equal(witnesses.way, before.way) else None
         return replace(archive, witnesses=witnesses, mujoco_c=mujoco_c)
 
@@ -272,12 +274,11 @@ class OfFaults(Stage):
             raise ValueError(f"{rule}: {judging.search.run} has no faults that it can cross")
         self._check_certifiers(archive, judging, renewed="others" in before)
 
-    @staticmethod
-    def _check_certifiers(archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
+    def _check_certifiers(self, archive: Archive, judging: Judging, *, renewed: bool = False) -> None:
         """Refuses faults whose certifier has no file, or another one unless certificates are ``renewed`` before."""
         hashes = {name: str(controller_hash(policy)) for name, policy in judging.certifiers.items()}
         certify = {*compress(archive.certifiers, np.any(archive.certificates[archive.is_fault], axis=0).tolist())}
-        if archive.witnesses is not None:
+        if archive.witnesses is not None and self.crosses_steered:
             certify |= {*archive.witnesses.walker[archive.is_fault & ~archive.certified_by_controllers].tolist()}
         stored = dict(zip(archive.certifiers, archive.certifier_sha256, strict=True))
         names = [name for name in sorted(certify - {SEARCHED}) if hashes.get(name) != stored.get(name, "")]

@@ -52,7 +52,7 @@ def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dic
     return {
         "iterations": archive.iterations,
         "terrains_evaluated": sum(row["terrains"] for row in metrics),
-        "episodes": sum(row["episodes"] for row in metrics),
+        "episodes": sum(row["episodes"] + row.get("label_episodes", 0) for row in metrics),
         "elites": len(archive),
         "reachable_cells": archive.cells.num_cells,
         "reachable_coverage": archive.reachable_coverage,

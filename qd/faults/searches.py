@@ -73,7 +73,12 @@ def check_certifiers(certifiers: Mapping[str, str], search: Search, device: str)
             raise ValueError(f"{rule}, got {policy}, where there is none: give the path of one")
         if is_searched(search.cfg, policy, search.robot):
             raise ValueError(f"certifier {name} must be another controller than the searched one, got {policy}")
-        try:
-            check_policy(policy, search.robot, device)
-        except ValueError as error:
-            raise ValueError(f"certifier {name} does not fit {search.robot.name}: {error}") from error
+        check_fits(name, policy, search.robot, device)
+
+
+def check_fits(name: str, policy: str, robot: RobotCfg, device: str) -> None:
+    """Tries a certifier on a robot."""
+    try:
+        check_policy(policy, robot, device)
+    except ValueError as error:
+        raise ValueError(f"certifier {name} does not fit {robot.name}: {error}") from error

@@ -298,7 +298,8 @@ _TABLES: dict[str, tuple[type[Table], dict[str, tuple[str, str]]]] = {
 _BY_JUDGING = (_GROUPED, _CROSSED, *(dict(columns.values()) for _, columns in _TABLES.values()))  # whole, or not at all
 _TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause", "witness_walker"} - {"intervals", "collision_bit", "iterations", "scales"}
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
-_WHOLE = {name for name in _SHAPES if name.endswith(("outcomes", "counts", "kind", "cell", "family", "iteration"))}
+_WHOLE_ENDS = ("outcomes", "counts", "kind", "cell", "family", "iteration", "iterations", "episodes", "intervals")
+_WHOLE = {name for name in _SHAPES if name.endswith(_WHOLE_ENDS)}
 _FINITE = ("genes", "fitness", "scales", "witness_way", "witness_limit_m")
 
 

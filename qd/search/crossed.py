@@ -1,29 +1,32 @@
 """Whether anybody crosses what stops the searched controller: labels, from which a surrogate learns what earns less.
 
-After iterations 1, 2, 4, 8 and so on, the robot's panel crosses failing elites that are drawn at random. Where none of
-it arrives, the searched controller tries random ways near the line (:mod:`qd.faults.steer`). That it arrives, however
-far from the line, is no certificate; but where the panel does not cross it hardly ever does.
+After iterations 1, 2, 4, 8 and so on, failing elites are drawn at random. Somebody crosses one if the searched
+controller has reached its goal before, or a controller of the robot's panel does in at least half of a few episodes, or
+the searched one does in any, by random ways near the line (:mod:`qd.faults.steer`). That is no certificate.
 """
 
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
 
-from qd.faults.searches import controllers_in
+from qd.faults.searches import check_fits, controllers_in
 from qd.faults.steer import LINE_M, SteerCfg, cross_ways, draw_ways, first_ways
+from qd.search.directory import Metrics
 from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg, is_searched
-from qd.workers.compute import Compute, check_policy
+from qd.workers.compute import Compute
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
+from sim.controllers.spec import controller_hash
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
 
 MOST = 500
-"""Elites that are labelled after an iteration."""
+"""Elites that are labelled after an iteration, and no more than it has terrains."""
 EPISODES, WAYS = 4, 8
 """Of each controller of the panel, and of the searched one."""
 
@@ -31,28 +34,33 @@ EPISODES, WAYS = 4, 8
 class Labeller(ExitStack):
     """Finds out for a search whether anybody crosses its failing elites; on a GPU its simulations stay open."""
 
-    def __init__(self, cfg: SearchCfg, robot: RobotCfg, policy: str, compute: Compute) -> None:
+    def __init__(self, cfg: SearchCfg, robot: RobotCfg, policy: str, compute: Compute, metrics: Metrics) -> None:
+        """A search goes on with the panel that it began with, as its ``metrics`` have it."""
         super().__init__()
-        if compute.on_ray:  # whose workers have the searched controller alone
-            compute = Compute.resolve()
+        if compute.on_ray:  # whose workers go on with the search
+            compute = Compute.resolve() if compute.on_gpu else Compute()
         self._cfg, self._robot, self._policy = cfg, robot, policy
-        panel = controllers_in(robot.panel).values()
-        self._panel = [file for file in panel if not is_searched(cfg, file, robot)]
-        for file in self._panel:
-            check_policy(file, robot, compute.device)
+        panel = {name: file for name, file in controllers_in(robot.panel).items() if not is_searched(cfg, file, robot)}
+        for name, file in panel.items():
+            check_fits(name, file, robot, compute.device)
+        self._panel = list(panel.values())
+        self._hashes = {name: controller_hash(file) for name, file in panel.items()}
+        if metrics and (before := metrics[-1]["panel"]) != self._hashes:
+            names = ", ".join(sorted({*before} | {*self._hashes})) or "none"
+            raise ValueError(f"the panel in {robot.panel} must be that of the search, got others: {names}: put it back")
         self._on_gpu = compute.on_gpu
         self._crossers = defaultdict[str, Crosser](lambda: self.enter_context(Crosser(robot, compute)))
 
-    def label(self, scheduler: Scheduler, iteration: int, show: Callable[[str], None]) -> dict[str, int]:
+    def label(self, scheduler: Scheduler, iteration: int, show: Callable[[str], None]) -> dict[str, Any]:
         """Tells the search which of some elites somebody crosses; how many they are, and what that took in episodes.
 
         ``show`` gets a line that says how far that is.
         """
-        counts = {"labelled": 0, "labelled_crossed": 0, "label_episodes": 0}
+        counts: dict[str, Any] = {"labelled": 0, "labelled_crossed": 0, "label_episodes": 0, "panel": self._hashes}
         if iteration & (iteration - 1):
             return counts
         rng = np.random.default_rng(np.random.SeedSequence([self._cfg.seed, iteration], spawn_key=(Stream.CROSSED,)))
-        rows, genes, goal_rate = scheduler.ask_crossed(MOST, rng)
+        rows, genes, goal_rate = scheduler.ask_crossed(min(MOST, self._cfg.scheduler.num_terrains), rng)
         space = get_space(self._cfg.space, self._cfg.space_sha256)
         seeds = rng.integers(2**32, size=len(rows), dtype=np.uint32)
         terrains = Terrains(genes=genes, seeds=seeds, space=space)

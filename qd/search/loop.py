@@ -87,7 +87,6 @@ def search(
     check_policy(policy, robot, compute.device)
     space = get_space(cfg.space, cfg.space_sha256)
     run = RunDirectory(path)
-    labeller = Labeller(cfg, robot, policy, compute) if cfg.fitness.crossed else None
     crossing = PipelineCfg(
         compute=compute,
         robot=robot,
@@ -111,6 +110,7 @@ def search(
                 cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed
             )
             scheduler.compute_on(compute.device)
+            labeller = Labeller(cfg, robot, policy, compute, metrics) if cfg.fitness.crossed else None
             try:
                 with open_pipeline(crossing) as pipeline, labeller or nullcontext():
                     run.begin_session(cfg, compute.origin(cfg.seed), done)
@@ -186,10 +186,11 @@ def _run_iterations(
         row = describe_metrics(archive, RolloutResult.join(results), join_evaluations(evaluations))
         if labeller is not None:
             labels = labeller.label(scheduler, iteration, partial(bar.move_to, iteration))
-            row |= labels | {"episodes": row["episodes"] + labels["label_episodes"]}
+            row |= labels
         wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
         began += wall_s
-        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s, "episodes_per_s": row["episodes"] / wall_s}
+        episodes = row["episodes"] + row.get("label_episodes", 0)
+        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
         if status := pipeline.status():
             row |= status._asdict()
         metrics.append(row)

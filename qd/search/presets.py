@@ -42,7 +42,8 @@ class SchedulerCfg(*_BASES):
         """Refuses that what nobody crosses earns less where no surrogate learns that, or no pool goes by it."""
         if crossed and (self.methods != ("surrogate",) or not self.again):
             rule = "fitness.crossed must be 0 unless the method is surrogate alone and scheduler.again 1 or more"
-            raise ValueError(f"{rule}, got {crossed:g} with {self.method} and {self.again}")
+            got = f"got {crossed:g} with {self.method} and {self.again}"
+            raise ValueError(f"{rule}, {got}: give --scheduler.again 90, as preset wide has")
 
     @property
     def methods(self) -> tuple[str, ...]:

@@ -126,6 +126,9 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None
     score = f"QD score {archive.qd_score:.0f}, mean fitness {archive.mean_fitness:.2f}"
     effort = f"after {numbers['episodes']:,} episodes in {clock(numbers['wall_s'])}"
     say(f"{len(archive):,} elites in {archive.reachable_coverage:.1%} of the reachable cells, {score}, {effort}")
+    if labelled := sum(row.get("labelled", 0) for row in metrics):
+        count = sum(row["labelled_crossed"] for row in metrics)
+        print(f"Of {labelled:,} failing elites that were tried, somebody crosses {count:,}.")
     if (share := metrics[-1]["last_tenth"]) is not None:
         print(f"Its last tenth brought {share:.0%} of the elites that can be expected to stay.")
     print(f"Figures: {', '.join(map(str, figures))}")

@@ -146,8 +146,7 @@ class Scheduler:
     @property
     def _surrogate(self) -> Any:
         """The surrogate that learns whether anybody crosses terrains; None where none does."""
-        surrogates: list[Any] = [getattr(method, "surrogate", None) for method in self.methods]
-        return next((each for each in surrogates if each is not None and each.crossed), None)
+        return getattr(self.methods[0], "surrogate", None) if self._pool and self._pool.fitness.crossed else None
 
     def ask_crossed(
         self, most: int, rng: np.random.Generator

@@ -33,7 +33,8 @@ _NUM_RATES = 3  # goal rate, collision rate, collision bit
 _DRAWS = 4  # of the ratios of a terrain, for each network's fitness and collision
 _LABELLED_SHARE = 0.25  # of each batch, drawn among the terrains of which is known whether anybody crosses them
 _STORED = (
-    "cfg", "cells", "crossed", "space_name", "space_sha256", "squared_error", "_rng", "_genes", "_targets", "_scale",
+    "cfg", "cells", "crossed", "space_name", "space_sha256", "squared_error", "knows_both", "_rng", "_genes",
+    "_targets", "_scale",
 )  # fmt: skip
 _ERROR_STEP = 0.1  # of the known error of ratios toward that of the latest terrains
 
@@ -87,6 +88,8 @@ class Surrogate:
         self._scale = np.stack([np.zeros(num_numbers), np.ones(num_numbers)]).astype(np.float32)
         self.squared_error: NDArray[np.float32] | None = None
         """Of predicted ratios, their episodes' noise included, shape (P,); None before the networks are asked."""
+        self.knows_both = False
+        """Whether it was told of terrains that somebody crosses, and of others that nobody does."""
         self._networks = Networks(1 + num_maps(space), self._targets.shape[1])
         for weights in self._networks.parameters():
             drawn = self._rng.normal(size=weights.shape) * np.sqrt(2.0 / max(1, weights[0].numel()))
@@ -131,11 +134,6 @@ class Surrogate:
         """Rows of the terrains of which is known whether anybody crosses them."""
         return np.flatnonzero(~np.isnan(self._targets[:, -1])) if self.crossed else np.zeros(0, np.int64)
 
-    @property
-    def _knows_both(self) -> bool:
-        """Whether somebody crosses some of these, and nobody others."""
-        return len({*self._targets[self._labelled, -1].tolist()}) == 2
-
     def learn(
         self, genes: NDArray[np.float32], evaluation: Evaluation, crossed: NDArray[np.bool_] | None = None
     ) -> None:
@@ -148,7 +146,7 @@ class Surrogate:
         valid = evaluation.valid
         genes = clipped(genes[valid])
         with on_stream(self._stream):
-            if len(genes) and len(self) >= MIN_TERRAINS:
+            if len(genes) and len(self) >= MIN_TERRAINS and crossed is None:  # else it knows them already
                 predicted = self.predict(torch.from_numpy(genes).to(self.device)).ratios.mean(0).cpu().numpy()
                 squared_error = ((predicted - evaluation.ratios[valid]) ** 2).mean(axis=0).astype(np.float32)
                 before = squared_error if self.squared_error is None else self.squared_error
@@ -170,6 +168,7 @@ class Surrogate:
                 self._genes = np.concatenate([self._genes, units])[-self._capacity :]
                 self._targets = np.concatenate([self._targets, targets])[-self._capacity :]
                 self._num_unmapped = min(self._num_unmapped + len(units), len(self))
+                self.knows_both = len({*self._targets[self._labelled, -1].tolist()}) == 2
                 numbers = self._split(self._targets)[1].astype(np.float32)
                 self._scale = np.stack([numbers.mean(axis=0), numbers.std(axis=0) + 1e-3])
             if len(self) >= MIN_TERRAINS:
@@ -234,14 +233,14 @@ class Surrogate:
         columns = torch.cat([self._networks.judge(self._map_genes(chunk)) for chunk in chunks])
         ratios, numbers, rates, crossed = self._split(columns.transpose(0, 1))
         middle, spread = torch.from_numpy(self._scale).to(self.device)
-        chance = crossed[..., 0].sigmoid() if self._knows_both else torch.ones_like(rates[..., 0])
+        chance = crossed[..., 0].sigmoid() if self.knows_both else torch.ones_like(rates[..., 0])
         return Prediction(ratios.softmax(-1), numbers.clamp(-10.0, 10.0) * spread + middle, rates, chance)
 
     def find_chance(self, genes: NDArray[np.float32], goal_rate: NDArray[np.float64]) -> NDArray[np.float64]:
         """Chance that somebody crosses terrains, (N, num_genes), shape (N,): 1 where the goal was reached before."""
         chance = np.ones(len(genes))
         rows = np.flatnonzero(goal_rate == 0.0)
-        if self._knows_both and len(rows):
+        if self.knows_both and len(rows):
             with on_stream(self._stream):
                 predicted = self.predict(torch.from_numpy(genes[rows]).to(self.device))
                 chance[rows] = predicted.chance.mean(0).cpu().numpy()

@@ -133,8 +133,9 @@ class UserSpace(TerrainSpace):
         return self._call_for_genes("scaled", clipped(self.validate(genes)), scale)
 
     def _call_for_genes(self, method: str, *arguments: Any) -> NDArray[np.float32]:
+        returned = self._call(method, *arguments)
         try:
-            return clipped(self.validate(self._call(method, *arguments)))
+            return clipped(self.validate(returned))
         except (TypeError, ValueError) as error:
             raise self._wrong(method, f"must return genes: {error}") from None
 

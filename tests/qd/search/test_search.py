@@ -247,10 +247,15 @@ def test_a_search_asks_who_crosses_what_stops_the_robot_and_goes_on_as_if_never_
     first, second, steered = (tried[name] for name in ("C-G", "S", "steered"))
     assert 18 == first > second > steered > 0 and len(tried) == 4  # each tries what those before do not cross
     assert sum(row["label_episodes"] for row in rows) == 4 * (first + second) + 8 * steered
-    assert sum(row["episodes"] for row in rows) == 4 * (len(robots.crossed) + steered)
+    assert sum(row["episodes"] for row in rows) == 4 * (len(robots.crossed) - first - second - steered)
+    everything = 4 * len(robots.crossed) + 4 * steered
+    assert json.loads((tmp_path / "whole/archive.json").read_text())["episodes"] == everything
     for count in (50, len(robots.crossed) - 3):  # in an iteration, and while the last ones are asked about
         with pytest.raises(Interrupted, match="--resume"):
             run(tmp_path / str(count), **CROSSED, opener=Robots(partly_late, stop_after=count))
+        with monkeypatch.context() as patch, pytest.raises(ValueError, match="panel"):
+            patch.setattr(labels, "controllers_in", lambda folder: {})  # it would be asked no more
+            run(tmp_path / str(count), **CROSSED, opener=Robots(partly_late))
         run(tmp_path / str(count), **CROSSED, opener=Robots(partly_late))
         assert rows_of(tmp_path / str(count)) == rows
         assert (tmp_path / str(count) / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
