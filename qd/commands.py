@@ -178,12 +178,12 @@ class JudgeCommand(_RunFlags):
     resolved, 1 ms steps and a contact time constant of 3 ms. An elite that fails there too is confirmed. others: other
     controllers cross those that fail, at the search's settings and with contact resolved. An elite is certified if one
     of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. steered: of what
-    nobody crosses, ways are sought by which the controller itself, or else another, does: slower, or a little aside.
+    nobody crosses, ways are sought by which the controller itself, or else another, does: at other speeds, aside.
     One that is never more than 0.5 m from the straight line certifies, too. varied: faults are crossed again under 20
     draws of moderate conditions, payload, motor strength, delay, noise and friction. A fault is robust if the
     controller still crosses under half of them, and another at least half. mujoco_c: 150 faults at random, one a family
     first, are crossed in MuJoCo C with steps of 1 ms, in 6 episodes, or 10 if these do not decide whether half of 10
-    reach the goal. A fault holds there if the controller crosses under half, and its best certifier at least half.
+    reach the goal. A fault holds there if the controller crosses under half, and what certifies it at least half.
     Crossings are kept, but those of steered, so the same command goes on after Ctrl-C.
     """
 

@@ -356,7 +356,7 @@ class InMujocoC(OfFaults):
         super().check(archive, judging, before)
 
     def run(self, archive: Archive, judging: Judging) -> Archive:
-        """The archive with outcomes of the controller, and of the best certifier of each fault that it still fails."""
+        """The archive with outcomes of the controller, and of what certifies each fault that it still fails."""
         self._check_certifiers(archive, judging)
         search = judging.search
         rounds = len(self.episodes)

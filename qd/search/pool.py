@@ -61,7 +61,7 @@ class Pool:
         number: By which each is known, ascending, shape (N,).
         chance: That somebody crosses each, as far as the search knows, shape (N,).
         holds: Whether each held a cell when the cells were settled last, shape (N,).
-        labelled: Whether it was tried if anybody crosses each, shape (N,).
+        labelled: Whether others have tried to cross each, shape (N,).
     """
 
     def __init__(self, num_genes: int, cells: Cells, fitness: FitnessCfg) -> None:

@@ -1,8 +1,8 @@
 """Does a search find more faults where what nobody crosses earns less? Weights of ``--fitness.crossed``: crossed.json.
 
-Searches of preset wide differ in the weight alone. Those with a weight have an iteration less, which is more than their
-labels take. Their failing elites are crossed with contact resolved and by the robot's panel. The searches of seed 20
-chose the weight of preset wide; those of other seeds, with it and without, are compared.
+Searches of preset wide differ in the weight alone. Those with a weight have an iteration less, for their labels. Their
+failing elites are crossed with contact resolved and by the robot's panel, which gave the labels, too, by other
+episodes. The searches of seed 20 choose the weight; those of other seeds, with it and without, are compared.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,8 @@ def follow(script: Script, weight: float, seed: int) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Writes means of the chosen weight and of 0 with 95 % t intervals over seeds; parts are searches alone."""
-    searches = {name_part(weight, seed): (weight, seed) for seed in (CHOOSING, *SEEDS) for weight in WEIGHTS}
+    chosen = [(weight, seed) for seed in SEEDS for weight in (0.0, CHOSEN)]
+    searches = {name_part(*each): each for each in (*((weight, CHOOSING) for weight in WEIGHTS), *chosen)}
     script = parse(__doc__, argv, "crossed.json", parts=tuple(searches))
     for part in script.parts:
         follow(script, *searches[part])

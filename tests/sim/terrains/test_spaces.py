@@ -331,6 +331,7 @@ def test_numpy_will_do(write):
         ("class", "1 / 0\nclass", "ZeroDivisionError"),
         ("class Space", "class Other", "Other"),
         ("    def", method("hard_random(self, count, rng)", "rng.random((count, 5))") + "    def", "hard_random"),
+        ("    def", method("hard_random(self, count, rng)", "1 / 0") + "    def", "^(?!.*must).*hard_random fails"),
         ("    def", method("friction(self, genes, x, y)", "x.new_full((3, 4, 8), 2.0)") + "    def", "friction"),
         ("    def", method("friction(self, genes, x, y)", "x.new_ones(3, 8, 4)") + "    def", "friction"),
     ],
