@@ -7,7 +7,6 @@ obstacle is an element of a course (:mod:`sim.terrains.elements`) of any size, w
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -180,8 +179,11 @@ def measure_dose(
         sets = {name: dose_set(dose, count, seed) for name, dose in doses.items()}
         engine, cache = "resolved" if resolved else "search", crossings_folder(robot)
         results = cross_sets(controllers, sets, robot, compute, episodes, engine=engine, cache=cache)
-        pairs = product(doses, controllers)
-        rows = {(name, by): measure_rates(name, doses[name], by, results[name][by]) for name, by in pairs}
+        rows = {
+            (name, controller): measure_rates(name, dose, controller, results[name][controller])
+            for name, dose in doses.items()
+            for controller in controllers
+        }
         return {
             **compute.origin(seed),
             "robot": robot.name,

@@ -109,9 +109,12 @@ def evaluate(
     others = [policy for policy in controllers.values() if policy != str(robot.policy_file)]
     scales = read_penalty_scales(robot, others[0] if others else None)
     results = cross_sets(controllers, sets, robot, compute or Compute(), episodes, reward=True, cache=cache)
-    measured = {name: {by: measure(result, scales) for by, result in row.items()} for name, row in results.items()}
+    performances = {
+        name: {controller: measure(result, scales) for controller, result in row.items()}
+        for name, row in results.items()
+    }
     about = describe_controllers(controllers, robot)
-    return make_tables(measured, sets, robot, controllers=about, episodes=episodes, seed=seed)
+    return make_tables(performances, sets, robot, controllers=about, episodes=episodes, seed=seed)
 
 
 def evaluate_tables(

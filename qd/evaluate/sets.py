@@ -22,7 +22,7 @@ from qd.evaluate.labels import HELD_OUT, INDEPENDENT, SETS
 from qd.faults.families import find_families, rms_distances
 from qd.search.archive import Archive
 from qd.search.directory import read_robot_archive, search_seed
-from qd.search.fitness import Table
+from qd.search.fitness import ColumnTable
 from sim.controllers.formats.rsl_rl import read_weights
 from sim.controllers.spec import ControllerSpec
 from sim.files.atomic import read_json
@@ -63,7 +63,7 @@ class EliteSplit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TerrainSet(Table):
+class TerrainSet(ColumnTable):
     """T terrains to cross, and what is known of each."""
 
     terrains: Terrains

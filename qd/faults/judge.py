@@ -241,16 +241,15 @@ class Steered(Stage):
         terrains = judging.elite_terrains(archive, rows, Stream.STEERED)
         times = len(walkers) * cfg.seeds
         seeds = elite_seeds(archive, search.cfg.seed, times, stream=Stream.STEERED).reshape(-1, times)[rows]
-        level = at_height(SUPER_GAUSSIAN, MAX_HEIGHT * search.space.height_share)
-        plain = plain_set("hard_random", _LINE_TERRAINS, search.cfg.seed, level, "validation").terrains
         before = archive.witnesses
-        tried = before is not None and (before.walker != "").any()  # their kinds are by that limit
-        limit_m = before.limit_m if before and tried else measure_line(crosser, search.policy, plain, judging.step)
+        if before is None or not (before.walker != "").any():
+            level = at_height(SUPER_GAUSSIAN, MAX_HEIGHT * search.space.height_share)
+            plain = plain_set("hard_random", _LINE_TERRAINS, search.cfg.seed, level, "validation").terrains
+            before = no_witnesses(len(archive), measure_line(crosser, search.policy, plain, judging.step))
         rng = np.random.default_rng(np.random.SeedSequence([search.cfg.seed], spawn_key=(Stream.STEERED,)))
-        some = seek_witnesses(crosser, walkers, terrains, seeds, limit_m, rng=rng, label=judging.step, cfg=cfg)
+        some = seek_witnesses(crosser, walkers, terrains, seeds, before.limit_m, rng=rng, label=judging.step, cfg=cfg)
         found = [f"{(some.kind == kind).sum()} {words}" for kind, words in _WITNESS_WORDS.items()]
         print(f"Steered, robots cross {', '.join(found)}, of {len(rows)} terrains not certified before.", flush=True)
-        before = before if before and tried else no_witnesses(len(archive), limit_m)
         witnesses = before.updated(rows, some)
         mujoco_c = archive.mujoco_c if np.array_equal(witnesses.way, before.way) else None
         return replace(archive, witnesses=witnesses, mujoco_c=mujoco_c)

@@ -274,9 +274,11 @@ def minimise(
                 elites = STAGES[stage].run(elites, judging)
         if not numbers:
             print(f"{run}: none of {len(archive):,} elites fails.")
-        entries = {n: _entry(archive, n, cases[n], search) for n in numbers}
-        for row, (entry, verdict) in enumerate(zip(entries.values(), find_verdicts(elites), strict=True)):
-            entry |= {"verdict": VERDICTS[verdict], **judgement(elites, row)}
+        verdicts = [VERDICTS[verdict] for verdict in find_verdicts(elites)]
+        entries = {
+            n: _entry(archive, n, cases[n], search) | {"verdict": verdicts[row], **judgement(elites, row)}
+            for row, n in enumerate(numbers)
+        }
         genes = dict(zip(numbers, elites.genes, strict=True))
         if stored := read_minimal(run, archive):
             entries = {entry["elite"]: entry for entry in stored.numbers["elites"]} | entries

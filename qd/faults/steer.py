@@ -97,7 +97,7 @@ def seek_witnesses(
         others = drawn[off, generations:-2]
         ways[off] = find_ways(crosser, policy, some[off], others, limit_m=None, label=f"{words} around", **how)
         counts[off, 0, 1] = try_ways(crosser, policy, some[off], ways[off], drawn[off, -2], limit_m, label=words)
-        cross = np.flatnonzero(counts[:, 0, 1, 2] >= FAILING_GOAL_RATE * np.maximum(counts[:, 0, 1, 3], 1))
+        cross = np.flatnonzero(cross_half(counts[:, 0, 1])[:, -1])
         for column, tried in enumerate((plain, ways)):
             again, fine = (some[cross], tried[cross], drawn[cross, -1]), f"{words}, contact resolved"
             counts[cross, 1, column] = try_ways(crosser, policy, *again, limit_m, fine, "resolved")
@@ -223,6 +223,11 @@ def count_goals(result: RolloutResult, limit_m: float) -> NDArray[np.int64]:
     return np.stack([*reached, (~result.invalid).sum(axis=1)], axis=1)
 
 
+def cross_half(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether at least half of the episodes reach the goal on the line, beside it, and at all; counts are (..., 4)."""
+    return (counts[..., 3:] > 0) & (counts[..., :3] >= FAILING_GOAL_RATE * counts[..., 3:])
+
+
 def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """The kind of witness that each of T ways is, as its index in :data:`WITNESSES`, shape (T,).
 
@@ -234,12 +239,12 @@ def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     if not len(counts):
         return kinds
     goals_plain, valid_plain = counts[:, :, 0, 2], counts[:, :, 0, 3]
-    valid = counts[:, :, 1, 3]
+    valid, crossed = counts[:, :, 1, 3], cross_half(counts[:, :, 1])
     known = (counts[..., 3] >= (1.0 - MAX_INVALID_SHARE) * EPISODES).all(axis=(1, 2))
     for kind, column in ((1, 2), (2, 1), (3, 0)):
         goals = counts[:, :, 1, column]
         p = fisher_p(goals, valid, goals_plain, valid_plain).max(axis=1)
-        crosses = known & (goals >= FAILING_GOAL_RATE * valid).all(axis=1)
+        crosses = known & crossed[..., column].all(axis=1)
         lucky = false_discovery_control(np.clip(p, 0.0, 1.0)) > MAX_FALSE_DISCOVERIES
         kinds[crosses & ~lucky] = kind
     return kinds

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kernels.episode import SEGMENTS, STEERING
 from qd.search.descriptors import Cells
-from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, Evaluation, Table
+from qd.search.fitness import FAILING_GOAL_RATE, FITNESS_FLOOR, ColumnTable, Evaluation
 from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
 from sim.files.settings import PositiveInt
@@ -42,7 +42,7 @@ WITNESSES = ("", "around", "beside", "line")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Witnesses(Table):
+class Witnesses(ColumnTable):
     """Ways by which a controller crosses some of N elites, if it does (:mod:`qd.faults.steer`)."""
 
     walker: NDArray[np.str_]
@@ -98,7 +98,7 @@ def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CrossedAgain(Table):
+class CrossedAgain(ColumnTable):
     """Outcomes of N elites, as of an :class:`Archive`, some of which were crossed under other conditions."""
 
     searched: NDArray[np.int64]
@@ -289,7 +289,7 @@ _CROSSED = {**_CERTIFIERS, "resolved_outcomes": "N4", "certifier_outcomes": "NC4
 _WITNESS = {"walker": "N", "kind": "N", "way": "NS3", "counts": "N224", "limit_m": ""}
 _VARIED = {"searched": ("varied_outcomes", "N4"), "certifiers": ("certifier_varied_outcomes", "NC4")}
 _MUJOCO_C = {name: (key.replace("varied", "mujoco_c"), shape) for name, (key, shape) in _VARIED.items()}
-_TABLES: dict[str, tuple[type[Table], dict[str, tuple[str, str]]]] = {
+_TABLES: dict[str, tuple[type[ColumnTable], dict[str, tuple[str, str]]]] = {
     "varied": (CrossedAgain, _VARIED),
     "mujoco_c": (CrossedAgain, _MUJOCO_C | {"steered": ("steered_mujoco_c_outcomes", "N4")}),
     "fresh": (FreshValues, {name: (f"fresh_{name}", shape) for name, shape in {**_VALUES, "reproduced": "N"}.items()}),
@@ -300,6 +300,7 @@ _TEXTS = {*_SETTINGS, *_CERTIFIERS, "cause", "witness_walker"} - {"intervals", "
 _SHAPES = {name: shape for group in (_SETTINGS, _FOUND, *_BY_JUDGING) for name, shape in group.items()}
 _WHOLE_ENDS = ("outcomes", "counts", "kind", "cell", "family", "iteration", "iterations", "episodes", "intervals")
 _WHOLE = {name for name in _SHAPES if name.endswith(_WHOLE_ENDS)}
+_CONTENTS = {"U": "texts", "i": "whole numbers", "bif": "numbers"}  # by kinds of NumPy types
 _FINITE = ("genes", "fitness", "scales", "witness_way", "witness_limit_m")
 
 
@@ -331,10 +332,9 @@ def read_archive(path: str | Path) -> Archive:
         sizes = {"2": 2, "3": len(STEERING), "4": len(OUTCOMES), "S": SEGMENTS}
         check_shapes(arrays, {name: [sizes.get(size, size) for size in _SHAPES[name]] for name in arrays})
         for name, array in arrays.items():
-            kinds, content = ("i", "whole numbers") if name in _WHOLE else ("bif", "numbers")
-            kinds, content = ("U", "texts") if name in _TEXTS else (kinds, content)
+            kinds = "U" if name in _TEXTS else "i" if name in _WHOLE else "bif"
             if array.dtype.kind not in kinds:
-                raise ValueError(f"{name} must hold {content}, got {array.dtype}")
+                raise ValueError(f"{name} must hold {_CONTENTS[kinds]}, got {array.dtype}")
             if name in _FINITE and not np.isfinite(array).all():
                 raise ValueError(f"{name} must be finite")
         values: dict[str, Any] = no_outcomes(len(arrays["fitness"])) | arrays

@@ -54,18 +54,18 @@ class FitnessCfg:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class ColumnTable:
     """Columns of equally many rows: arrays, terrains, and tables of further columns."""
 
     def rows(self, chosen: NDArray[Any]) -> Self:
         """Some of the rows alone, in the order given; arrays are copied."""
         columns = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray | Terrains)}
-        tables: dict[str, Any] = {name: v.rows(chosen) for name, v in vars(self).items() if isinstance(v, Table)}
+        tables: dict[str, Any] = {name: v.rows(chosen) for name, v in vars(self).items() if isinstance(v, ColumnTable)}
         return replace(self, **{name: column[chosen] for name, column in columns.items()}, **tables)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation(Table):
+class Evaluation(ColumnTable):
     """Evaluations of T terrains; statistics are over valid episodes, penalties are scaled.
 
     Shapes are (T, P) for what each of P penalties has, ratios, means and standard deviations, and else (T,).
@@ -186,7 +186,12 @@ def find_worth(fitness: Any, chance: Any, crossed: float) -> Any:
     """
     if not crossed:
         return fitness
-    return FITNESS_FLOOR + (fitness - FITNESS_FLOOR) * (1.0 - crossed * (1.0 - chance))
+    return FITNESS_FLOOR + (fitness - FITNESS_FLOOR) * kept_share(chance, crossed)
+
+
+def kept_share(chance: Any, crossed: float) -> Any:
+    """Share of its worth that a terrain keeps which somebody crosses with that chance."""
+    return 1.0 - crossed * (1.0 - chance)
 
 
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:

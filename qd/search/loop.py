@@ -185,8 +185,7 @@ def _run_iterations(
         archive = build_archive(cfg, scheduler, iteration)
         row = describe_metrics(archive, RolloutResult.join(results), join_evaluations(evaluations))
         if labeller is not None:
-            labels = labeller.label(scheduler, iteration, partial(bar.move_to, iteration))
-            row |= labels
+            row |= labeller.label(scheduler, iteration, partial(bar.move_to, iteration))
         wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
         began += wall_s
         episodes = row["episodes"] + row.get("label_episodes", 0)

@@ -10,7 +10,15 @@ from scipy.special import ndtr
 
 from qd.faults.numbers import FRESH_EPISODES
 from qd.search.descriptors import Cells
-from qd.search.fitness import BIT_EPISODES, FITNESS_FLOOR, Evaluation, FitnessCfg, join_evaluations, merge_evaluations
+from qd.search.fitness import (
+    BIT_EPISODES,
+    FITNESS_FLOOR,
+    Evaluation,
+    FitnessCfg,
+    join_evaluations,
+    kept_share,
+    merge_evaluations,
+)
 
 DEPTH = 3
 """Terrains that each cell has at most."""
@@ -136,7 +144,7 @@ class Pool:
     def _find_score(self, terrains: Evaluation) -> NDArray[np.float64]:
         """What each is expected to add to the QD score; less where nobody may cross it."""
         score = expected_score(terrains, self.cells, self.fitness)
-        return score * (1.0 - self.fitness.crossed * (1.0 - self.chance))
+        return score * kept_share(self.chance, self.fitness.crossed)
 
 
 def _rank(group: NDArray[np.int64], key: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.int64]:

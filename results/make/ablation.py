@@ -56,7 +56,10 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
                 archive = search(of_alpha, script.runs / "ablation" / f"{name}-{count}", script.compute)
                 rows[name].append(look_again(archive, of_alpha, script.policy, crosser))
     columns = {"mean_std": "mean_std", "intervals": "mean_std_interval", "elites": "elites"}
-    numbers = {name: {run: [row[key] for row in of] for run, of in rows.items()} for name, key in columns.items()}
+    numbers = {
+        name: {run: [row[key] for row in rows_of_run] for run, rows_of_run in rows.items()}
+        for name, key in columns.items()
+    }
     return script.write({"preset": cfg.preset, "iterations": iterations, **numbers})
 
 

@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from qd.evaluate.sets import read_space
 from qd.faults.judge import elite_seeds
 from qd.faults.numbers import EPISODES
-from qd.faults.steer import LINE_M, SteerCfg, count_goals, find_kinds, mix_segments, move_to_best, score_ways
+from qd.faults.steer import (
+    LINE_M,
+    SteerCfg,
+    count_goals,
+    cross_half,
+    find_kinds,
+    mix_segments,
+    move_to_best,
+    score_ways,
+)
 from qd.search.archive import WITNESSES
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.seeds import Stream
@@ -186,11 +195,6 @@ def measure(
         "curve": curve,
     }
     return numbers, kinds
-
-
-def cross_half(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether at least half of the episodes reach the goal on the line, beside it, and at all; counts are (..., 4)."""
-    return (counts[..., 3:] > 0) & (counts[..., :3] >= FAILING_GOAL_RATE * counts[..., 3:])
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

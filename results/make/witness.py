@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from qd.faults.judge import elite_seeds, judge
-from qd.faults.steer import SteerCfg, find_kinds, find_ways, try_ways
+from qd.faults.steer import SteerCfg, cross_half, find_kinds, find_ways, try_ways
 from qd.search.archive import WITNESSES, Archive
 from qd.search.directory import RunDirectory
-from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import ARCHIVE_FILES, Script, parse
@@ -83,7 +82,7 @@ def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.n
             how: Any = {"rng": np.random.default_rng(script.seed), "label": "curve", "cfg": cfg}
             ways = find_ways(crosser, script.policy, terrains, seeds[:, :-1], limit_m=limit, **how)
             counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, "curve")
-            crossed = counts[:, :3] >= FAILING_GOAL_RATE * np.maximum(counts[:, 3:], 1)
+            crossed = cross_half(counts)
             words = dict(zip(("line", "beside", "around"), crossed.mean(axis=0).tolist(), strict=True))
             points.append({"episodes": generations * cfg.samples, "limit_m": limit, "terrains": len(rows), **words})
     return points

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from kernels.episode import Outcome
-from qd.faults.steer import SteerCfg
+from qd.faults.steer import SteerCfg, cross_half
 from results.make import residual
-from results.make.residual import OffsetPolicy, cross_half, find_offsets, seek_offsets
+from results.make.residual import OffsetPolicy, find_offsets, seek_offsets
 from sim.controllers.runner import Memory, find_memory
 from sim.robots.find import get_robot
 from tests.qd.stand_in import result_of

@@ -225,10 +225,16 @@ def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
         rest = [groups.pop(cause) for cause in [*groups][_MAX_BARS - 1 :]]
         groups[f"{len(rest)} other causes"] = np.concatenate(rest)
     longest = max(map(len, groups.values()), default=1)
-    bars = {name: {"name": name, "failing": len(rows), "tile": tiles.get(name)} for name, rows in groups.items()}
-    for name, rows in groups.items():
-        bars[name] |= {"faults": int((ranking.verdict[rows] == _FAULT).sum()), "share": 100.0 / longest}
-    return [*bars.values()]
+    return [
+        {
+            "name": name,
+            "failing": len(rows),
+            "faults": int((ranking.verdict[rows] == _FAULT).sum()),
+            "share": 100.0 / longest,
+            "tile": tiles.get(name),
+        }
+        for name, rows in groups.items()
+    ]
 
 
 def _list_elites(ranking: Ranking) -> dict[str, Any]:

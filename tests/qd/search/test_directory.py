@@ -13,7 +13,7 @@ from qd.search import settings as module
 from qd.search.archive import CrossedAgain, goal_rates, read_archive, write_archive
 from qd.search.checkpoint import load_checkpoint
 from qd.search.directory import RunDirectory, claimed, find_run, output_folder, read_robot_archive, search_seed
-from qd.search.fitness import FitnessCfg, Table
+from qd.search.fitness import ColumnTable, FitnessCfg
 from qd.search.presets import SchedulerCfg
 from qd.search.settings import as_settings, differences, is_searched, preset
 from sim.controllers.spec import controller_hash
@@ -170,7 +170,7 @@ ARCHIVES = {"0": small_archive(0), "3": small_archive(3), "judged": grouped_arch
 def assert_same(stored, table):
     """Equal columns, and equal tables of further columns."""
     for name, value in vars(table).items():
-        if isinstance(value, Table):
+        if isinstance(value, ColumnTable):
             assert_same(getattr(stored, name), value)
         else:
             assert np.array_equal(getattr(stored, name), value), name
