@@ -110,7 +110,8 @@ def archives() -> str:
 
     def holding(row: Mapping[str, Any]) -> str:
         crossed = row.get("faults_mujoco_c")
-        return f"{crossed['hold']} of {crossed['tried']}" if crossed else NONE
+        some = {"": crossed, "strong: ": crossed["strong"]} if crossed else {}
+        return "; ".join(f"{label}{held['hold']} of {held['tried']}" for label, held in some.items()) or NONE
 
     columns = {
         "episodes": "episodes",
@@ -122,16 +123,102 @@ def archives() -> str:
         "... in families": "failing_families",
         "... *distinct* ones": "failing_distinct",
         "*confirmed*: failing, also with finer physics": "confirmed",
-        "*faults*: confirmed, and a controller of the panel crosses it": "faults_panel",
-        "... or one that was trained on these very terrains": "faults",
+        "*faults by controllers*: confirmed, and one of the panel crosses it": "faults_panel",
+        "... or one that was trained on these very terrains": "faults_controllers",
         "... that are no luck": "faults_fdr",
+        "... that are *strong*: crossed in under a fifth, by another controller in over four fifths": "strong",
+        "... that are *robust*: faults under varied conditions, too": "robust",
+        "*faults by a witness*: confirmed, and a controller crosses only steered, on the line": "faults_witness",
+        "all *faults*, of both kinds": "faults",
+        "... that hold in MuJoCo C, of some": holding,
         "families of all faults": "fault_families",
         "*distinct* faults": "faults_distinct",
-        "*strong* faults: crossed in under a fifth, by a certifier in over four fifths": "strong",
-        "*robust*: faults under varied conditions, too": "robust",
-        "faults that hold in MuJoCo C": holding,
     }
     return table({name: numbers for name, numbers in rows.items() if numbers}, columns, upright=True)
+
+
+def witnesses() -> str:
+    """Witnesses of the published archives, and how many plain crossings find by luck."""
+    rows = {}
+    for label, numbers in read_robots("results/{}/witness.json").items():
+        for name, judged in numbers["archives"].items():
+            rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = judged | judged["witnesses"]
+        rows[f"{label}, plain crossings in their place"] = numbers["control"]
+    columns: dict[str, Column] = {
+        "tried": "tried",
+        "witnesses on the line": "line",
+        "... of the searched controller": shown("by_walker", "searched", "line"),
+        "beside it": "beside",
+        "around": "around",
+        "faults by controllers": "faults_controllers",
+        "faults by a witness alone": "faults_witness",
+        "families of all faults": "fault_families",
+        "distinct faults": "faults_distinct",
+        "minutes": shown("wall_s", form=".1f", factor=1 / 60),
+    }
+    return table(rows, columns)
+
+
+def witness_curve() -> str:
+    """Shares of some terrains that are crossed where a search for ways spends so many episodes on each."""
+    rows: dict[str, dict[str, Any]] = {}
+    for label, numbers in read_robots("results/{}/witness.json").items():
+        for point in numbers["curve"]:
+            limited = "sought anywhere" if point["limit_m"] is None else "sought on the line"
+            rows.setdefault(f"{label}, {point['episodes']} episodes", {})[limited] = point
+    words = {"line": "on the line", "beside": "at most beside it", "around": "at all"}
+    columns = {
+        f"{limited}: {word}": shown(limited, name, form=".2f")
+        for limited, (name, word) in product(("sought on the line", "sought anywhere"), words.items())
+    }
+    return table(rows, columns)
+
+
+def crossed() -> str:
+    """Searches in which what nobody crosses earns less, and not: means over seeds, and differences."""
+    rows = {}
+    for label, numbers in read_robots("results/{}/crossed.json").items():
+        rows[f"{label}, without"] = numbers["weights"]["0"]
+        rows[f"{label}, with it"] = numbers["weights"][f"{numbers['chosen']:g}"]
+        rows[f"{label}, difference"] = numbers["difference"] | {"sign": "+"}
+    return table(rows, crossed_columns())
+
+
+def crossed_weights() -> str:
+    """The searches by which the weight on what nobody crosses was chosen, one each."""
+    rows = {}
+    for label, numbers in read_robots("results/{}/crossed.json").items():
+        for search in numbers["searches"]:  # those that choose stand first
+            rows.setdefault(f"{label}, weight {search['weight']:g}", search)
+    return table(rows, crossed_columns())
+
+
+def crossed_columns() -> dict[str, Column]:
+    """Columns of searches of crossed.json; numbers of a row with a ``sign`` have one."""
+
+    def cell(row: Any, name: str) -> str:
+        return shown(name, form=row.get("sign", "") + (".3f" if name == "uncrossed_share" else ",.0f"))(row)
+
+    columns = counts("failing", "faults_panel") | {"distinct faults": "faults_distinct"} | counts("fault_families")
+    columns |= {"strong faults": "strong", "share of the failing that nobody crosses": "uncrossed_share"}
+    return {label: partial(cell, name=name) for label, name in columns.items()}
+
+
+def left() -> str:
+    """How many groups of failing elites and of faults searches see, and how many there are at least."""
+    rows = {
+        f"{label}, {name}, distance {least}": numbers[name] | groups
+        for label, numbers in read_robots("results/{}/left.json").items()
+        for name in ("failing", "faults")
+        for least, groups in numbers[name]["distances"].items()
+    }
+    columns: dict[str, Column] = {
+        "in all searches": "elites",
+        "groups that one search sees": lambda row: f"{row['growth'][0]:,.0f}",
+        "... that all see together": "groups",
+        "... that there are at least": "chao2",
+    }
+    return table(rows, columns)
 
 
 def training(measure: str = "goal") -> str:
@@ -398,6 +485,8 @@ def league() -> str:
         "failing families": at_heights("search", "failing_families", form=".0f"),
         "height [m]": shown("height", form=".2f"),
         "failing": shown("archive", "failing"),
+        "families of these": "failing_families",
+        "faults by a witness": "faults_witness",
         "commonest cause": list_causes(1),
     }
     return table(read("results/public.json").get("controllers", {}), columns)
@@ -507,6 +596,7 @@ TABLES: dict[str, Callable[..., str]] = {
     for make in (
         *(archives, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement),
         *(minimal, packs, league, films, drives, speed, kernels, conditions, condition_examples, differences),
+        *(witnesses, witness_curve, crossed, crossed_weights, left),
     )
 }
 

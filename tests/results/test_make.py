@@ -237,6 +237,50 @@ def test_a_cell_is_a_number_with_its_interval():
     assert made.splitlines()[2:] == ["| cm | 50.0 (20.0 to 100.0) | 25.0 |", "| rate | 0.50 (0.20 to 1.00) | 0.25 |"]
 
 
+def test_tables_of_witnesses_tell_certificates_by_controllers_from_others(monkeypatch):
+    judged = {"witnesses": {"tried": 9, "line": 3, "beside": 2, "around": 1}, "wall_s": 90.0, "fault_families": 6}
+    judged |= {"by_walker": {"searched": {"line": 2}}, "faults_controllers": 4, "faults_witness": 3}
+    point = {"episodes": 20, "line": 0.25, "beside": 0.5, "around": 0.75}
+    curve = [point | {"limit_m": 0.5, "line": 0.375}, point | {"limit_m": None}]
+    control = {"tried": 9, "line": 0, "beside": 0, "around": 1}
+    numbers = {"archives": {"archive": judged}, "control": control, "curve": curve}
+    monkeypatch.setattr(docs, "read_robots", lambda file: {"Dog": numbers})
+    assert docs.witnesses().splitlines()[2:] == [
+        "| Dog | 9 | 3 | 2 | 2 | 1 | 4 | 3 | 6 | 1.5 |",
+        "| Dog, plain crossings in their place | 9 | 0 | - | 0 | 1 | - | - | - | - |",
+    ]
+    assert docs.witness_curve().splitlines()[2:] == ["| Dog, 20 episodes | 0.38 | 0.50 | 0.75 | 0.25 | 0.50 | 0.75 |"]
+    held = {"hold": 5, "tried": 6, "strong": {"hold": 2, "tried": 3}}
+    monkeypatch.setattr(docs, "ROBOTS", {"dog": "Dog"})
+    monkeypatch.setattr(docs, "read", lambda file: {"dog": {"archive": {}}, "faults_mujoco_c": held})
+    cell = "5 of 6; strong: 2 of 3"
+    assert docs.archives().splitlines()[-1] == f"| ... that hold in MuJoCo C, of some | {cell} | {cell} | - |"
+
+
+def test_tables_of_searches_have_a_sign_where_they_are_differences(monkeypatch):
+    counts = {"failing": 100.0, "failing_interval": [90.0, 1100.0], "uncrossed_share": 0.5}
+    difference = {"failing": -5.0, "uncrossed_share": 0.125, "uncrossed_share_interval": [-0.25, 0.5]}
+    searches = [{"weight": 0.0, "failing": 7}, {"weight": 0.8, "failing": 8}, {"weight": 0.8, "failing": 9}]
+    weights = {"0": counts, "0.8": counts | {"failing": 1234.5}}
+    numbers = {"chosen": 0.8, "weights": weights, "difference": difference, "searches": searches}
+    groups = {"growth": [2.4, 4.0], "groups": 4, "chao2": 5.5, "chao2_interval": [4.2, 9.0]}
+    numbers |= {name: {"elites": 6, "distances": {"1": groups}} for name in ("failing", "faults")}
+    monkeypatch.setattr(docs, "read_robots", lambda file: {"Dog": numbers})
+    assert docs.crossed().splitlines()[2:] == [
+        "| Dog, without | 100 (90 to 1,100) | 0.500 |",
+        "| Dog, with it | 1,234 (90 to 1,100) | 0.500 |",
+        "| Dog, difference | -5 | +0.125 (-0.250 to +0.500) |",
+    ]
+    assert docs.crossed_weights().splitlines()[2:] == ["| Dog, weight 0 | 7 |", "| Dog, weight 0.8 | 8 |"]
+    assert docs.left().splitlines()[2] == "| Dog, failing, distance 1 | 6 | 2 | 4 | 6 (4 to 9) |"
+
+
+def test_a_table_without_its_file_is_empty(monkeypatch):
+    monkeypatch.setattr(docs, "read", lambda file: {})
+    tables = (docs.witnesses, docs.witness_curve, docs.crossed, docs.crossed_weights, docs.left, docs.league)
+    assert {make() for make in tables} == {docs.table({}, {})}
+
+
 def test_a_rate_of_training_names_the_packages_of_another_learner():
     rows = [{"train_env_steps_per_s": 2000.4}, {"train_env_steps_per_s": 7.0, "versions": {"a": "1.2"}}]
     row = {"ours": 2000.4, "theirs": 7.0, "lost": 3.0, "training": rows}
