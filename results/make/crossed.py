@@ -7,13 +7,14 @@ episodes. The searches of seed 20 choose the weight; those of other seeds, with 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from results.make.common import COUNTS, Script, file_name, follow_search, mean_counts, origin_of, parse
 
-WEIGHTS, CHOSEN = (0.0, 0.5, 0.8, 0.95), 0.95
+WEIGHTS, CHOSEN = (0.0, 0.95), 0.95
 CHOOSING, SEEDS = 20, (21, 22, 23)
-"""Others than those of search.json and left.json."""
+"""Others than those of search.json."""
 EPISODES = 384_000
 STAGES = ("fresh", "resolved", "others")
 SHARE = "uncrossed_share"
@@ -26,12 +27,17 @@ def name_part(weight: float, seed: int) -> str:
     return f"{weight:g}, seed {seed}"
 
 
+def run_of(script: Script, weight: float, seed: int) -> Path:
+    """The run of a search."""
+    return script.runs / "crossed" / file_name(name_part(weight, seed))
+
+
 def follow(script: Script, weight: float, seed: int) -> dict[str, Any]:
     """Counts of a search with their origin, searched and judged where today's sources have not."""
     cfg = script.search_cfg(seed=seed, **({"again": 2} if script.small else {}))
     (iterations,) = script.count_iterations(cfg, EPISODES)
     cfg = replace(cfg, fitness=replace(cfg.fitness, crossed=weight))
-    run = script.runs / "crossed" / file_name(name_part(weight, seed))
+    run = run_of(script, weight, seed)
     (counts,) = follow_search(script, run, cfg, [max(1, iterations - (weight > 0.0))], COUNTS, STAGES)
     failing, certified = counts["failing"], counts["certified"]
     share = 1.0 - certified / failing if failing and certified is not None else None

@@ -1,10 +1,10 @@
 """How many failures and faults searches have not seen yet: left.json.
 
-Five searches of the default, of equal episodes and as in search.json, differ in their seeds alone. Their failing elites
-are put into groups, and so are their faults by the panel: distinct terrains lead a group each, in order of fitness, and
-the others belong to the nearest of these. By how many searches see each group, Chao2 says how many there are at least
-that such a search can find. Searches hardly ever find the same distinct terrains, so that this says little; groups of
-terrains up to two and three times as far apart are counted, too.
+Four searches of the default, those of crossed.json, differ in their seeds alone. Their failing elites are put into
+groups, and so are their faults by the panel: distinct terrains lead a group each, in order of fitness, and the others
+belong to the nearest of these. By how many searches see each group, Chao2 says how many there are at least that such a
+search can find. Searches hardly ever find the same distinct terrains, so that this says little; groups of terrains up
+to two and three times as far apart are counted, too.
 """
 
 from collections.abc import Sequence
@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from qd.evaluate.sets import read_space
 from qd.faults.families import best_values, kin_distances, pick_distinct
 from qd.search.archive import Archive, read_archive
-from results.make import search
+from results.make import crossed
 from results.make.common import parse
 
-SEEDS = (*search.SEEDS, 13, 14)
-"""Those of search.json, and more."""
+SEEDS = (crossed.CHOOSING, *crossed.SEEDS)
 DISTANCES = (1.0, 2.0, 3.0)
 """Least distances of leaders; terrains that are nearer than 1 are kin."""
 _Z = 1.959963984540054  # the normal distribution's 97.5 % quantile
@@ -83,13 +82,11 @@ def count_left(archives: Sequence[Archive], rows: Sequence[NDArray[np.bool_]]) -
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Searches where today's sources have not, and counts; parts are searches alone."""
-    script = parse(__doc__, argv, "left.json", parts=tuple(map(str, SEEDS)))
-    seeds = [int(part) for part in script.parts] or SEEDS[: 2 if script.small else None]
-    searches = [search.follow(script, search.DEFAULT, seed)[-1] for seed in seeds]
-    if script.parts:
-        return {}
-    archives = [read_archive(search.run_of(script, search.DEFAULT, seed)) for seed in seeds]
+    """Counts, and searches where today's sources have not."""
+    script = parse(__doc__, argv, "left.json")
+    seeds = SEEDS[: 2 if script.small else None]
+    searches = [crossed.follow(script, crossed.CHOSEN, seed) for seed in seeds]
+    archives = [read_archive(crossed.run_of(script, crossed.CHOSEN, seed)) for seed in seeds]
     rows = {"failing": [archive.failing for archive in archives], "faults": [each.is_fault for each in archives]}
     numbers = {name: count_left(archives, chosen) for name, chosen in rows.items()}
     return script.write({**numbers, "searches": searches})
