@@ -15,6 +15,7 @@ import numpy as np
 from qd.faults.searches import check_fits, controllers_in
 from qd.faults.steer import LINE_M, SteerCfg, cross_ways, draw_ways, first_ways
 from qd.search.directory import Metrics
+from qd.search.presets import SchedulerCfg
 from qd.search.scheduler import Scheduler
 from qd.search.settings import SearchCfg, is_searched
 from qd.workers.compute import Compute
@@ -29,6 +30,13 @@ MOST = 500
 """Elites that are labelled after an iteration, and no more than it has terrains."""
 EPISODES, WAYS = 4, 8
 """Of each controller of the panel, and of the searched one."""
+USUAL = 0.95
+"""How much less what nobody crosses is worth in a search of a robot with a panel (results/make/crossed.py)."""
+
+
+def usual_crossed(scheduler: SchedulerCfg, robot: RobotCfg) -> float:
+    """The default of ``--fitness.crossed``; 0 without a panel, whose certificates are what was measured."""
+    return USUAL if scheduler.learns_crossed and controllers_in(robot.panel) else 0.0
 
 
 class Labeller(ExitStack):

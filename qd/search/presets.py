@@ -39,11 +39,16 @@ class SchedulerCfg(*_BASES):
             raise ValueError(f"scheduler.settling must be below the iterations, {iterations}, got {self.settling}")
 
     def check_crossed(self, crossed: float) -> None:
-        """Refuses that what nobody crosses earns less where no surrogate learns that, or no pool goes by it."""
-        if crossed and (self.methods != ("surrogate",) or not self.again):
+        """Refuses that what nobody crosses earns less where no search learns it."""
+        if crossed and not self.learns_crossed:
             rule = "fitness.crossed must be 0 unless the method is surrogate alone and scheduler.again 1 or more"
             got = f"got {crossed:g} with {self.method} and {self.again}"
             raise ValueError(f"{rule}, {got}: give --scheduler.again 90, as preset wide has")
+
+    @property
+    def learns_crossed(self) -> bool:
+        """Whether a search learns what nobody crosses, and a pool goes by it."""
+        return self.methods == ("surrogate",) and self.again > 0
 
     @property
     def methods(self) -> tuple[str, ...]:

@@ -199,8 +199,9 @@ def crossed_columns() -> dict[str, Column]:
     def cell(row: Any, name: str) -> str:
         return shown(name, form=row.get("sign", "") + (".3f" if name == "uncrossed_share" else ",.0f"))(row)
 
-    columns = counts("failing", "faults_panel") | {"distinct faults": "faults_distinct"} | counts("fault_families")
-    columns |= {"strong faults": "strong", "share of the failing that nobody crosses": "uncrossed_share"}
+    columns = {"failing": "failing", "distinct failing": "failing_distinct", "faults by the panel": "faults_panel"}
+    columns |= {"distinct faults": "faults_distinct", "fault families": "fault_families", "strong faults": "strong"}
+    columns["share of the failing that nobody crosses"] = "uncrossed_share"
     return {label: partial(cell, name=name) for label, name in columns.items()}
 
 

@@ -14,7 +14,9 @@ from qd.commands import ArchiveCommand
 from qd.faults.judge import judge
 from qd.search import loop, settings
 from qd.search.archive import read_archive
+from qd.search.crossed import usual_crossed
 from qd.search.methods import METHODS
+from qd.search.presets import PRESETS
 from qd.search.results import print_summary
 from qd.workers.compute import Compute
 from sim.files.command import run_command
@@ -94,6 +96,19 @@ def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, m
         assert name in fails(capsys, *TINY, "--scheduler.again", again, "--scheduler.settling", settling)
     assert "fitness.crossed" in fails(capsys, *TINY, "--fitness.crossed", ".5")
     assert os.listdir() == []
+
+
+def test_what_nobody_crosses_earns_less_by_itself_where_that_can_be_learned_and_a_panel_says_it():
+    robot, wide = get_robot("anymal"), PRESETS["wide"]["scheduler"]
+    assert usual_crossed(wide, robot) == 0.95
+    for scheduler in (replace(wide, method="map_elites"), replace(wide, again=0), PRESETS["small"]["scheduler"]):
+        assert usual_crossed(scheduler, robot) == 0.0
+    assert usual_crossed(wide, replace(robot, name="dog")) == 0.0  # without a panel
+    for number, (flags, weight) in enumerate(((["--scheduler.again", "2"], 0.95), ([], 0.0))):
+        assert archive(*TINY, *flags, "--run-dir", f"{number}") == 0
+        assert config_of(f"{number}")["settings"]["fitness"]["crossed"] == weight
+    assert archive(*TINY, "--scheduler.again", "2", "--fitness.crossed", "0", "--run-dir", "a") == 0
+    assert archive("--resume", "a", *MORE, "2") == 0  # 0 is the default of this run now
 
 
 def test_flags_come_to_the_settings_of_the_run():
