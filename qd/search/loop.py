@@ -36,7 +36,7 @@ from sim.files.command import BEGAN, Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.registry import at_height, get_space, is_user_space, load_space, space_at
+from sim.terrains.spaces.registry import at_height, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
 
 
@@ -85,7 +85,7 @@ def search(
         raise ValueError(f"fitness.penalties must be some of {robot.name}'s, {known}, got {', '.join(sorted(unknown))}")
     policy = policy or resolve_policy(cfg.policy, robot)
     check_policy(policy, robot, compute.device)
-    space = get_space(cfg.space, cfg.space_sha256)
+    space = cfg.terrain_space
     run = RunDirectory(path)
     crossing = PipelineCfg(
         compute=compute,
@@ -148,7 +148,7 @@ def _run_iterations(
     labeller: Labeller | None, bar: Bar, until: float | None,
 ) -> None:  # fmt: skip
     """Runs the iterations that are left in a fixed order, so that a search that goes on is one that never stopped."""
-    space = get_space(cfg.space, cfg.space_sha256)
+    space = cfg.terrain_space
     num_groups = cfg.scheduler.num_groups
     last = find_last_iteration(cfg, metrics, until)
 

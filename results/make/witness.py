@@ -21,7 +21,6 @@ from qd.search.directory import RunDirectory
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import ARCHIVE_FILES, Script, parse
-from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
 
 ARCHIVES = ("archive", "archive_cma_mae")
@@ -91,8 +90,7 @@ def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.n
 def elites_to_steer(archive: Archive, rows: np.ndarray, seed: int, times: int) -> tuple[Terrains, np.ndarray]:
     """Some elites as terrains, and seeds of so many evaluations of each, (N, times)."""
     seeds = elite_seeds(archive, seed, times, stream=Stream.STEERED).reshape(-1, times)[rows]
-    space = get_space(archive.space, archive.space_sha256)
-    return Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=space), seeds
+    return Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=archive.terrain_space), seeds
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
