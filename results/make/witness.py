@@ -65,7 +65,8 @@ def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np
     for kind, engine in enumerate(("search", "resolved")):
         for side in range(2):
             drawn = seeds[:, 2 * kind + side]
-            counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, "control", engine)
+            how: Any = {"label": "control", "engine": engine}
+            counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, **how)
     found = find_kinds(counts)
     return {"tried": len(rows)} | {word: int((found == kind).sum()) for kind, word in _KINDS}
 
@@ -80,7 +81,7 @@ def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.n
             terrains, seeds = elites_to_steer(archive, rows, script.seed + 1, generations + 1)
             how: Any = {"rng": np.random.default_rng(script.seed), "label": "curve", "cfg": cfg}
             ways = find_ways(crosser, script.policy, terrains, seeds[:, :-1], limit_m=limit, **how)
-            counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, "curve")
+            counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, label="curve")
             crossed = cross_half(counts)
             words = dict(zip(("line", "beside", "around"), crossed.mean(axis=0).tolist(), strict=True))
             points.append({"episodes": generations * cfg.samples, "limit_m": limit, "terrains": len(rows), **words})
