@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.check import ensure_ready
+from qd.faults.numbers import count_episodes
 from qd.search.archive import Archive
 from qd.search.crossed import Labeller
 from qd.search.directory import Metrics, RunDirectory, claimed
@@ -188,8 +189,8 @@ def _run_iterations(
             row |= labeller.label(scheduler, iteration, partial(bar.move_to, iteration))
         wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
         began += wall_s
-        episodes = row["episodes"] + row.get("label_episodes", 0)
-        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
+        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s}
+        row["episodes_per_s"] = count_episodes([row]) / wall_s
         if status := pipeline.status():
             row |= status._asdict()
         metrics.append(row)
