@@ -61,6 +61,7 @@ def write_report(
     suffix = "" if policy is None else opened_run.suffix(controller)
     out = out or output_folder(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     page.check_page(out)
+    device = choose_device(device)
     compared = None
     if tables is not None:
         file = without_machine(str(tables))
@@ -70,7 +71,7 @@ def write_report(
     cases: dict[int, dict[str, Any]] = {}
     missing = []
     try:
-        check_policy(opened_run.policy(policy), opened_run.robot, choose_device(device))
+        check_policy(opened_run.policy(policy), opened_run.robot, device)
     except ValueError as error:
         if policy is not None:  # one that the user names must be able to cross
             raise
