@@ -456,7 +456,6 @@ def judge(
 
 
 def _write(archive: Archive, judging: Judging, stage: str) -> None:
-    """Writes archive, numbers and figures of a run after a stage."""
     run = RunDirectory(judging.search.run)
     assert archive.fresh is not None
     file = run.path / SUMMARY_FILE

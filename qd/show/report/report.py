@@ -82,7 +82,6 @@ def write_report(
             open_context(8, 8).free()
         except ValueError as error:
             missing.append(f"Close pictures are left out: {error}.")
-        device = choose_device(device)
         cases = cross_cases(opened_run, ranking, controller, heads, others, device, pictured=not missing)
         lost = [number for number in (*heads, *others) if number not in cases]
         missing += [f"All crossings of elite {number} were invalid this time." for number in lost]
@@ -258,7 +257,6 @@ def _list_elites(ranking: Ranking) -> dict[str, Any]:
 
 
 def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:
-    """Every minimal terrain, as the elites."""
     rows = [
         {
             "elite": f"{entry['elite']}",
