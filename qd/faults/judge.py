@@ -446,8 +446,6 @@ def judge(
         archive = search.read_archive()
         for index, name in enumerate(stages):
             STAGES[name].check(archive, judging, stages[:index])
-        if archive.fresh is not None and archive.family is None:
-            archive = with_families(archive, search)
         for number, name in enumerate(stages, 1):
             step = f"{number} of {len(stages)}: "
             archive = STAGES[name].run(archive, replace(judging, step=step, most_steered=most_steered))
