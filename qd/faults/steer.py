@@ -206,10 +206,7 @@ def try_ways(
     crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.float32], seeds: NDArray[np.uint32],
     limit_m: float, **how: Any,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """20 episodes by each of T ways, or under the plain command where it is NaN, as ``Witnesses.counts`` has them.
-
-    Shape (T, 4).
-    """
+    """20 episodes by each of T ways, or under the plain command where it is NaN: (T, 4), as ``Witnesses.counts``."""
     result = cross_ways(crosser, policy, terrains, np.repeat(ways[:, None], EPISODES, axis=1), seeds, **how)
     return count_goals(result, limit_m)
 
