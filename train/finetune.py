@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from qd.evaluate.sets import TRAINED_ON, elites_sha256, hash_elites, read_space, read_trained_on, split_elites
+from qd.evaluate.sets import TRAINED_ON, elites_sha256, hash_elites, read_trained_on, split_elites
 from qd.faults.numbers import SPECIALIST as CERTIFIER
 from qd.faults.searches import CERTIFIERS_FOLDER
 from qd.search.directory import RunDirectory, find_directory, find_run, read_robot_archive
@@ -138,7 +138,7 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     if not any(map(len, genes)):
         names = ", ".join(map(str, paths))
         raise ValueError(f"{names} must have elites to train on that are {cfg.recipe.only}, got none")
-    spaces = tuple(map(read_space, archives))
+    spaces = tuple(archive.terrain_space for archive in archives)
     return TrainingElites(genes=tuple(genes), spaces=spaces, goal_rate=np.concatenate(goal_rates), archives=records)
 
 

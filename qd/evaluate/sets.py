@@ -31,7 +31,6 @@ from sim.robots.training import PaperCfg
 from sim.terrains.bank import make_heights
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, hand_crafted_crossings
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
@@ -194,15 +193,10 @@ def random_elites(name: str, archive: Archive, count: int, seed: int, trained_on
 def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.uint32]) -> TerrainSet:
     """A set of elites with their families in the whole archive, if it was judged: kin of kin may not be in the set."""
     elites = archive.rows(rows)
-    space = read_space(archive)
+    space = archive.terrain_space
     if elites.family is None:
         elites = replace(elites, family=find_families(elites.genes, space))
     return TerrainSet(terrains=Terrains(genes=elites.genes, seeds=seeds, space=space), numbers=rows, elites=elites)
-
-
-def read_space(archive: Archive) -> TerrainSpace:
-    """The terrain space of an archive."""
-    return get_space(archive.space, archive.space_sha256)
 
 
 def nearest_distance(

@@ -446,8 +446,6 @@ def judge(
         archive = search.read_archive()
         for index, name in enumerate(stages):
             STAGES[name].check(archive, judging, stages[:index])
-        if archive.fresh is not None and archive.family is None:
-            archive = with_families(archive, search)
         for number, name in enumerate(stages, 1):
             step = f"{number} of {len(stages)}: "
             archive = STAGES[name].run(archive, replace(judging, step=step, most_steered=most_steered))
@@ -456,7 +454,6 @@ def judge(
 
 
 def _write(archive: Archive, judging: Judging, stage: str) -> None:
-    """Writes archive, numbers and figures of a run after a stage."""
     run = RunDirectory(judging.search.run)
     assert archive.fresh is not None
     file = run.path / SUMMARY_FILE

@@ -296,7 +296,6 @@ def minimise(
 def _write(
     judging: Judging, entries: Mapping[int, dict[str, Any]], genes: Mapping[int, NDArray[np.float32]]
 ) -> MinimalTerrains:
-    """Writes numbers, genes and figure of all minimal terrains of a run."""
     search = judging.search
     ordered = [entries[number] for number in sorted(entries)]
     genes = {number: genes[number] for number in sorted(entries)}

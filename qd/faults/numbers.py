@@ -52,7 +52,7 @@ def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dic
     return {
         "iterations": archive.iterations,
         "terrains_evaluated": sum(row["terrains"] for row in metrics),
-        "episodes": sum(row["episodes"] + row.get("label_episodes", 0) for row in metrics),
+        "episodes": count_episodes(metrics),
         "elites": len(archive),
         "reachable_cells": archive.cells.num_cells,
         "reachable_coverage": archive.reachable_coverage,
@@ -63,6 +63,11 @@ def found_numbers(archive: Archive, metrics: Sequence[Mapping[str, Any]]) -> dic
         "wall_s": sum(row["wall_s"] for row in metrics),
         "invalid_episodes": sum(row["invalid_episodes"] for row in metrics),
     }
+
+
+def count_episodes(metrics: Sequence[Mapping[str, Any]]) -> int:
+    """Episodes of some iterations, with those that found out whether anybody crosses terrains."""
+    return sum(row["episodes"] + row.get("label_episodes", 0) for row in metrics)
 
 
 def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from sim.controllers.spec import controller_hash, resolve_policy, weights_file
 from sim.robots.find import resolve_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import get_space, load_space
+from sim.terrains.spaces.registry import load_space
 
 CERTIFIERS_FOLDER = "certifiers"
 """Folder of a run that holds certifiers trained for it, ``<name>.pt``."""
@@ -47,7 +47,7 @@ def find_search(run: Path, *, robot: str | None = None, policy: str | None = Non
     controller = find_policy(run, cfg, robot_cfg) if policy is None else resolve_policy(policy, robot_cfg)
     if not is_searched(cfg, controller, robot_cfg):
         raise ValueError(f"policy must be the controller that was searched, {cfg.policy}, got {policy}: leave it out")
-    return Search(run=run, cfg=cfg, robot=robot_cfg, policy=controller, space=get_space(cfg.space, cfg.space_sha256))
+    return Search(run=run, cfg=cfg, robot=robot_cfg, policy=controller, space=cfg.terrain_space)
 
 
 def controllers_in(folder: Path) -> dict[str, str]:

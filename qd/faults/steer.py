@@ -19,7 +19,6 @@ from qd.search.archive import Witnesses, no_witnesses
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.search.progress import Bar
 from qd.workers.crosser import Crosser
-from qd.workers.pipeline import Engine, Progress
 from sim.controllers.described import read_speed_limits
 from sim.crossing import CrossingCfg, find_highest_command
 from sim.rates import MAX_INVALID_SHARE
@@ -100,7 +99,7 @@ def seek_witnesses(
         cross = np.flatnonzero(cross_half(counts[:, 0, 1])[:, -1])
         for column, tried in enumerate((plain, ways)):
             again, fine = (some[cross], tried[cross], drawn[cross, -1]), f"{words}, contact resolved"
-            counts[cross, 1, column] = try_ways(crosser, policy, *again, limit_m, fine, "resolved")
+            counts[cross, 1, column] = try_ways(crosser, policy, *again, limit_m, label=fine, engine="resolved")
         kind = find_kinds(counts)
         tried = Witnesses(walker=np.full(len(rows), name), kind=kind, way=ways, counts=counts, limit_m=limit_m)
         better = np.flatnonzero((kind > best.kind[rows]) | (best.walker[rows] == ""))
@@ -196,23 +195,19 @@ def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, c
 
 def cross_ways(
     crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.floating], seeds: NDArray[np.uint32],
-    label: str, engine: Engine = "search", progress: Progress | None = None, room: int = 0,
+    **how: Any,
 ) -> RolloutResult:  # fmt: skip
-    """Crossings of T terrains, an episode for each way: shape (T, R, SEGMENTS, 3)."""
+    """Crossings of T terrains, an episode for each way, shape (T, R, SEGMENTS, 3); ``how`` is of Crosser.cross."""
     steered = replace(terrains, seeds=seeds, steering=ways.astype(np.float32))
-    how: dict[str, Any] = {"replicas": ways.shape[1], "engine": engine, "progress": progress, "room": room}
-    return crosser.cross(policy, steered, **how, label=label, invalid_ok=True)
+    return crosser.cross(policy, steered, replicas=ways.shape[1], invalid_ok=True, **how)
 
 
 def try_ways(
     crosser: Crosser, policy: str, terrains: Terrains, ways: NDArray[np.float32], seeds: NDArray[np.uint32],
-    limit_m: float, label: str, engine: Engine = "search",
+    limit_m: float, **how: Any,
 ) -> NDArray[np.int64]:  # fmt: skip
-    """20 episodes by each of T ways, or under the plain command where it is NaN, as ``Witnesses.counts`` has them.
-
-    Shape (T, 4).
-    """
-    result = cross_ways(crosser, policy, terrains, np.repeat(ways[:, None], EPISODES, axis=1), seeds, label, engine)
+    """20 episodes by each of T ways, or under the plain command where it is NaN: (T, 4), as ``Witnesses.counts``."""
+    result = cross_ways(crosser, policy, terrains, np.repeat(ways[:, None], EPISODES, axis=1), seeds, **how)
     return count_goals(result, limit_m)
 
 
@@ -236,8 +231,6 @@ def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     No more than a quarter of the episodes of either may be invalid.
     """
     kinds = np.zeros(len(counts), np.int64)
-    if not len(counts):
-        return kinds
     goals_plain, valid_plain = counts[:, :, 0, 2], counts[:, :, 0, 3]
     valid, crossed = counts[:, :, 1, 3], cross_half(counts[:, :, 1])
     known = (counts[..., 3] >= (1.0 - MAX_INVALID_SHARE) * EPISODES).all(axis=(1, 2))

@@ -19,6 +19,8 @@ from sim.files.atomic import write_atomically
 from sim.files.npz import array_names, check_shapes, npz_bytes, read_arrays
 from sim.files.settings import PositiveInt
 from sim.rates import MAX_INVALID_SHARE
+from sim.terrains.spaces.base import TerrainSpace
+from sim.terrains.spaces.registry import get_space
 
 ARCHIVE_FILE = "archive.npz"
 
@@ -126,6 +128,11 @@ class Subject:
     """Intervals of each ratio."""
     collision_bit: bool
     """Whether base collision is a descriptor of its own."""
+
+    @property
+    def terrain_space(self) -> TerrainSpace:
+        """What the genes mean."""
+        return get_space(self.space, self.space_sha256)
 
     def named(self) -> dict[str, Any]:
         """Robot, controller and penalties: keys of :func:`sim.controllers.spec.controller_identity`."""

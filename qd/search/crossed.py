@@ -23,7 +23,6 @@ from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
 
 MOST = 500
@@ -69,9 +68,8 @@ class Labeller(ExitStack):
             return counts
         rng = np.random.default_rng(np.random.SeedSequence([self._cfg.seed, iteration], spawn_key=(Stream.CROSSED,)))
         rows, genes, goal_rate = scheduler.ask_crossed(min(MOST, self._cfg.scheduler.num_terrains), rng)
-        space = get_space(self._cfg.space, self._cfg.space_sha256)
         seeds = rng.integers(2**32, size=len(rows), dtype=np.uint32)
-        terrains = Terrains(genes=genes, seeds=seeds, space=space)
+        terrains = Terrains(genes=genes, seeds=seeds, space=self._cfg.terrain_space)
         crossed = goal_rate > 0.0
         for number, file in enumerate([*self._panel, None]):
             left = np.flatnonzero(~crossed)

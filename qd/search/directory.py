@@ -18,7 +18,7 @@ from qd.search.settings import SearchCfg, as_settings, differences
 from sim.files.atomic import is_leftover, locked, prepare_output, read_json, to_json, write_atomically
 from sim.files.settings import from_builtins
 from sim.robots.robot import RobotCfg, check_robot_identity
-from sim.terrains.spaces.registry import get_space, load_space
+from sim.terrains.spaces.registry import load_space
 
 RUNS = Path("runs")
 """Where runs are written, below the working folder."""
@@ -105,7 +105,7 @@ def check_space(archive: Archive, named: str | None) -> None:
     """Loads the terrain space that the command line names; refuses an archive whose space is not known then."""
     if named is not None:
         load_space(named)
-    expected, got = get_space(archive.space, archive.space_sha256).num_genes, archive.genes.shape[1]
+    expected, got = archive.terrain_space.num_genes, archive.genes.shape[1]
     if got != expected:
         rule = f"must have {expected} genes a terrain of {archive.space}"
         raise ValueError(f"the archive {rule}, got {got}: put a copy of it back")

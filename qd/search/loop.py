@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.check import ensure_ready
+from qd.faults.numbers import count_episodes
 from qd.search.archive import Archive
 from qd.search.crossed import Labeller
 from qd.search.directory import Metrics, RunDirectory, claimed
@@ -36,7 +37,7 @@ from sim.files.command import BEGAN, Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.registry import at_height, get_space, is_user_space, load_space, space_at
+from sim.terrains.spaces.registry import at_height, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
 
 
@@ -85,7 +86,7 @@ def search(
         raise ValueError(f"fitness.penalties must be some of {robot.name}'s, {known}, got {', '.join(sorted(unknown))}")
     policy = policy or resolve_policy(cfg.policy, robot)
     check_policy(policy, robot, compute.device)
-    space = get_space(cfg.space, cfg.space_sha256)
+    space = cfg.terrain_space
     run = RunDirectory(path)
     crossing = PipelineCfg(
         compute=compute,
@@ -148,7 +149,7 @@ def _run_iterations(
     labeller: Labeller | None, bar: Bar, until: float | None,
 ) -> None:  # fmt: skip
     """Runs the iterations that are left in a fixed order, so that a search that goes on is one that never stopped."""
-    space = get_space(cfg.space, cfg.space_sha256)
+    space = cfg.terrain_space
     num_groups = cfg.scheduler.num_groups
     last = find_last_iteration(cfg, metrics, until)
 
@@ -188,8 +189,8 @@ def _run_iterations(
             row |= labeller.label(scheduler, iteration, partial(bar.move_to, iteration))
         wall_s = time.perf_counter() - began  # from the end of the iteration before, so saving counts
         began += wall_s
-        episodes = row["episodes"] + row.get("label_episodes", 0)
-        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s, "episodes_per_s": episodes / wall_s}
+        row |= {"search_s": search_s, "terrains": num_new, "wall_s": wall_s}
+        row["episodes_per_s"] = count_episodes([row]) / wall_s
         if status := pipeline.status():
             row |= status._asdict()
         metrics.append(row)

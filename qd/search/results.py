@@ -24,7 +24,6 @@ from sim.files.settings import select_settings
 from sim.files.templates import open_templates
 from sim.robots.find import resolve_robot
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.registry import get_space
 
 UNTIL_FROM = 20
 """Iterations that must have crossed anything new before a search is judged by the last tenth of them."""
@@ -152,8 +151,7 @@ def print_summary(
     if not len(archive):
         return
     half_width = resolve_robot(archive.named(), robot, run).half_width
-    archive_space = get_space(archive.space, archive.space_sha256)
-    ranking = rank(archive, archive_space, read_minimal(run, archive), judged=True, half_width=half_width)
+    ranking = rank(archive, archive.terrain_space, read_minimal(run, archive), judged=True, half_width=half_width)
     if not len(ranking):
         return
     number = ranking.worst(1)[0]

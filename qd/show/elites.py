@@ -20,7 +20,6 @@ from sim.files.command import choose_elites, command_line
 from sim.robots.find import get_robot, resolve_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import get_space
 
 
 class EliteTerrain(NamedTuple):
@@ -64,7 +63,7 @@ class OpenedRun:
     @property
     def space(self) -> TerrainSpace:
         """What the genes mean."""
-        return get_space(self.archive.space, self.archive.space_sha256)
+        return self.archive.terrain_space
 
     @property
     def scales(self) -> dict[str, float]:

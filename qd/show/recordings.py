@@ -22,7 +22,7 @@ from sim.controllers.spec import controller_hash
 from sim.files.provenance import code_fingerprint
 from sim.recording.recorder import Recording, make_recording, read_recording, write_recording
 from sim.robots.robot import RobotCfg, robot_identity
-from sim.terrains.spaces.registry import get_space, space_key
+from sim.terrains.spaces.registry import space_key
 from sim.terrains.terrains import Terrains
 
 _LOT = 32  # terrains crossed side by side on a GPU
@@ -71,7 +71,7 @@ def request_elite(
     """
     genes = archive.genes[number] if minimal is None else minimal
     seeds = episode_seeds(seed, number, 1, stream=Stream.RECORDED_ELITE)
-    terrain = Terrains(genes=genes[None], seeds=seeds, space=get_space(archive.space, archive.space_sha256))
+    terrain = Terrains(genes=genes[None], seeds=seeds, space=archive.terrain_space)
     label = label or f"{'' if minimal is None else 'minimal terrain of '}elite {number} of {archive.robot}"
     return CrossingRequest(label=label, terrain=terrain, seed=seed, **crossing)
 

@@ -15,7 +15,6 @@ from qd.evaluate.sets import (
     make_sets,
     nearest_distance,
     paper_terrains,
-    read_space,
     read_trained_on,
     split_elites,
 )
@@ -31,16 +30,16 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     trained_on = genes[[mark in marks for mark in hash_elites(genes)]][: 20 if script.small else None]
     count = 5 if script.small else paper_terrains(script.robot.name)
     names = ("hard_random", "generated", "generated_far", "generated_independent")
-    sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=read_space(archive))
+    sets = make_sets(names, count, script.seed, archive=archive, independent=independent, space=archive.terrain_space)
     rows = {}
     for name, terrains in sets.items():
-        distances = nearest_distance(terrains.terrains.values, trained_on, read_space(archive))
+        distances = nearest_distance(terrains.terrains.values, trained_on, archive.terrain_space)
         least, median, largest = np.quantile(distances, (0.0, 0.5, 1.0)).tolist()
         rows[name] = {"terrains": len(distances), "median": median, "least": least, "largest": largest}
     counted = {}
     for name in ("archive", "archive_cma_mae", "independent"):
         elites = script.read_archive(name)
-        numbers = judged_numbers(elites, read_space(elites))
+        numbers = judged_numbers(elites, elites.terrain_space)
         counted[name] = {"elites": len(elites), **{key: numbers[key] for key in COUNTS if key in numbers}}
     distances = {"iterations": archive.iterations, "trained_on": len(trained_on), "nearest_m": rows}
     return script.write({**distances, "archives": counted})

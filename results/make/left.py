@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.sets import read_space
 from qd.faults.families import best_values, kin_distances, pick_distinct
 from qd.search.archive import Archive, read_archive
 from results.make import crossed
@@ -73,7 +72,7 @@ def count_left(archives: Sequence[Archive], rows: Sequence[NDArray[np.bool_]]) -
     fitness = np.concatenate([best_values(archive)[0]["fitness"] for archive in chosen])
     order = np.argsort(-fitness, kind="stable")
     of_search = np.repeat(np.arange(len(chosen)), [len(archive) for archive in chosen])[order]
-    distances = kin_distances(genes[order], read_space(archives[0]))
+    distances = kin_distances(genes[order], archives[0].terrain_space)
     numbers = dict[str, Any]()
     for least in DISTANCES:
         pairs = np.unique(np.stack([find_groups(distances, least), of_search]), axis=1)

@@ -18,7 +18,6 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from qd.evaluate.sets import read_space
 from qd.faults.judge import elite_seeds
 from qd.faults.numbers import EPISODES
 from qd.faults.steer import (
@@ -209,7 +208,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     rows = np.sort(rng.choice(is_open, count, replace=False))
     times = cfg.generations + 2
     seeds = elite_seeds(archive, script.seed, times, stream=Stream.RESIDUAL).reshape(-1, times)[rows]
-    terrains = Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=read_space(archive))
+    terrains = Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=archive.terrain_space)
     limit_m = LINE_M if archive.witnesses is None else archive.witnesses.limit_m
     forms, certified = dict[str, Any](), np.zeros(count, bool)
     for name, splines in FORMS.items():

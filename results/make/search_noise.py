@@ -20,7 +20,6 @@ from qd.search.pool import chance_to_stay
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import FRESH_COUNTS, ONCE, Script, file_name, parse
-from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
 
 SEEDS, EPISODES = (0, 1, 2), 400_000
@@ -54,7 +53,7 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
     assert archive.fresh is not None
     with Crosser(script.robot, script.compute, cache=run / "crossings") as crosser:
         seeds = elite_seeds(archive, cfg.seed, stream=Stream.FRESH_AGAIN)
-        terrains = Terrains(genes=archive.genes, seeds=seeds, space=get_space(archive.space))
+        terrains = Terrains(genes=archive.genes, seeds=seeds, space=archive.terrain_space)
         again = crosser.cross(script.policy, terrains, replicas=FRESH_EPISODES, label="once more", invalid_ok=True)
     second = fresh_values(archive, again, cfg.fitness)
     both = archive.fresh.valid & second.valid
@@ -70,9 +69,7 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
         "expected_same_cell": float(chance_to_stay(archive, archive.cells).sum()),
         "two_lots_agree": float((archive.fresh.cell == second.cell)[both].mean()) if both.any() else None,
         "failing_corrected": int(archive.failing[corrected].sum()),
-        "families_corrected": len(
-            np.unique(find_families(archive.genes[corrected], get_space(archive.space, archive.space_sha256)))
-        ),
+        "families_corrected": len(np.unique(find_families(archive.genes[corrected], archive.terrain_space))),
         "episodes_of_an_elite": float(np.median(archive.episodes)) if len(archive) else None,
     }
 

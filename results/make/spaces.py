@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-from qd.evaluate.sets import read_space
 from qd.faults.families import rank
 from qd.faults.judge import judge
 from qd.search.archive import Archive
@@ -23,7 +22,7 @@ def search_space(script: Script, name: str, cfg: SearchCfg) -> tuple[Archive, di
     archive = judge(run, stages=stages, compute=script.compute)
     summary = RunDirectory(run).read_summary()
     numbers = {count: summary.get(count) for count in ("iterations", "reachable_coverage", *COUNTS)}
-    by_cause = rank(archive, read_space(archive), half_width=script.robot.half_width, judged=True).by_cause()
+    by_cause = rank(archive, archive.terrain_space, half_width=script.robot.half_width, judged=True).by_cause()
     return archive, {**numbers, "causes": {cause: len(rows) for cause, rows in by_cause.items()}}
 
 

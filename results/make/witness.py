@@ -21,7 +21,6 @@ from qd.search.directory import RunDirectory
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import ARCHIVE_FILES, Script, parse
-from sim.terrains.spaces.registry import get_space
 from sim.terrains.terrains import Terrains
 
 ARCHIVES = ("archive", "archive_cma_mae")
@@ -66,7 +65,8 @@ def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np
     for kind, engine in enumerate(("search", "resolved")):
         for side in range(2):
             drawn = seeds[:, 2 * kind + side]
-            counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, "control", engine)
+            how: Any = {"label": "control", "engine": engine}
+            counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, **how)
     found = find_kinds(counts)
     return {"tried": len(rows)} | {word: int((found == kind).sum()) for kind, word in _KINDS}
 
@@ -81,7 +81,7 @@ def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.n
             terrains, seeds = elites_to_steer(archive, rows, script.seed + 1, generations + 1)
             how: Any = {"rng": np.random.default_rng(script.seed), "label": "curve", "cfg": cfg}
             ways = find_ways(crosser, script.policy, terrains, seeds[:, :-1], limit_m=limit, **how)
-            counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, "curve")
+            counts = try_ways(crosser, script.policy, terrains, ways, seeds[:, -1], limit_m, label="curve")
             crossed = cross_half(counts)
             words = dict(zip(("line", "beside", "around"), crossed.mean(axis=0).tolist(), strict=True))
             points.append({"episodes": generations * cfg.samples, "limit_m": limit, "terrains": len(rows), **words})
@@ -91,8 +91,7 @@ def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.n
 def elites_to_steer(archive: Archive, rows: np.ndarray, seed: int, times: int) -> tuple[Terrains, np.ndarray]:
     """Some elites as terrains, and seeds of so many evaluations of each, (N, times)."""
     seeds = elite_seeds(archive, seed, times, stream=Stream.STEERED).reshape(-1, times)[rows]
-    space = get_space(archive.space, archive.space_sha256)
-    return Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=space), seeds
+    return Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=archive.terrain_space), seeds
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

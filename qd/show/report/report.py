@@ -61,6 +61,7 @@ def write_report(
     suffix = "" if policy is None else opened_run.suffix(controller)
     out = out or output_folder(opened_run.path, opened_run.robot.name) / f"report{suffix}.html"
     page.check_page(out)
+    device = choose_device(device)
     compared = None
     if tables is not None:
         file = without_machine(str(tables))
@@ -70,7 +71,7 @@ def write_report(
     cases: dict[int, dict[str, Any]] = {}
     missing = []
     try:
-        check_policy(opened_run.policy(policy), opened_run.robot, choose_device(device))
+        check_policy(opened_run.policy(policy), opened_run.robot, device)
     except ValueError as error:
         if policy is not None:  # one that the user names must be able to cross
             raise
@@ -81,7 +82,6 @@ def write_report(
             open_context(8, 8).free()
         except ValueError as error:
             missing.append(f"Close pictures are left out: {error}.")
-        device = choose_device(device)
         cases = cross_cases(opened_run, ranking, controller, heads, others, device, pictured=not missing)
         lost = [number for number in (*heads, *others) if number not in cases]
         missing += [f"All crossings of elite {number} were invalid this time." for number in lost]
@@ -257,7 +257,6 @@ def _list_elites(ranking: Ranking) -> dict[str, Any]:
 
 
 def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:
-    """Every minimal terrain, as the elites."""
     rows = [
         {
             "elite": f"{entry['elite']}",

@@ -37,7 +37,6 @@ class App:
     """The page and its tabs."""
 
     def __init__(self, show: ViewedRun, recordings: Recordings, recorder: Recorder, *, host: str, port: int) -> None:
-        """Open the page."""
         self.tabs: dict[int, Tab] = {}
         self.bars: dict[int, PlayerBar] = {}
         self._tasks = queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]]()

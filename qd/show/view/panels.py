@@ -273,7 +273,6 @@ class PlayerBar:
 
 
 def _small(text: str) -> str:
-    """HTML in small print."""
     return f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>' if text else ""
 
 

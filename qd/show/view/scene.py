@@ -67,7 +67,6 @@ def _mesh(vertices: NDArray[np.floating], faces: NDArray[np.integer], colors: ND
 
 
 def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """One mesh of several."""
     mesh = trimesh.util.concatenate(meshes)
     assert isinstance(mesh, trimesh.Trimesh)
     _ = mesh.vertex_normals  # once computed, an export has them
@@ -245,7 +244,6 @@ class Scene:
 
 
 def _move_bodies(bodies: Sequence[Any], crossing: Crossing, frame: int) -> None:
-    """Move the bodies of a robot to their poses at a frame."""
     for handle, position, turn in zip(bodies, crossing.positions[frame], crossing.quaternions[frame], strict=True):
         handle.position = tuple(position)
         handle.wxyz = tuple(turn)

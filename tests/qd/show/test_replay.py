@@ -65,7 +65,7 @@ def test_a_command_about_a_run_keeps_its_paths_and_names_code(opened_run, tmp_pa
     run = dataclasses.replace(opened_run, path=tmp_path / "runs" / "a", robot=dog)
     assert run.command("film", elite=3) == "faultline film --robot /mine/dog/robot.toml --run runs/a --elite 3"
     space = SimpleNamespace(name="/mine/hills.py:Hills", sha256="a" * 64)
-    monkeypatch.setattr("qd.show.elites.get_space", lambda name, sha256: space)
+    monkeypatch.setattr("qd.search.archive.get_space", lambda name, sha256: space)
     assert run.command("judge").endswith("--run runs/a --space /mine/hills.py:Hills")
 
 
