@@ -92,7 +92,7 @@ def seek_witnesses(
         counts = np.zeros((len(rows), 2, 2, 4), np.int64)
         for column, tried in enumerate((plain, ways)):
             counts[:, 0, column] = try_ways(crosser, policy, some, tried, drawn[:, -2], limit_m, label=words)
-        off = np.flatnonzero(counts[:, 0, 1, 0] < FAILING_GOAL_RATE * counts[:, 0, 1, 3])
+        off = np.flatnonzero(~cross_half(counts[:, 0, 1])[:, 0])
         others = drawn[off, generations:-2]
         ways[off] = find_ways(crosser, policy, some[off], others, limit_m=None, label=f"{words} around", **how)
         counts[off, 0, 1] = try_ways(crosser, policy, some[off], ways[off], drawn[off, -2], limit_m, label=words)
