@@ -83,9 +83,9 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     @staticmethod
     def help_values() -> dict[str, str]:
         """Names of conditions."""
-        from sim.terrains.conditions.kinds import CONDITIONS
+        from sim.terrains.conditions.kinds import CONDITIONS, GROUPS
 
-        return {"conditions": ", ".join(f"+{name}" for name in CONDITIONS)}
+        return {"conditions": ", ".join(f"+{name}" for name in (*CONDITIONS, *GROUPS))}
 
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> Self:

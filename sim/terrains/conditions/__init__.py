@@ -1,1 +1,3 @@
-"""Conditions under which robots cross, which belong to a terrain: payload, weak motors, delays, noise, a push."""
+"""Conditions under which robots cross, which belong to a terrain: payload, weak motors, delays, noise, pushes, and
+errors of what the robot sees.
+"""

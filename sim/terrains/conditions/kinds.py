@@ -95,6 +95,10 @@ CONDITIONS: dict[str, Condition] = {}
 """All conditions by name, in the order of their numbers in a row of conditions."""
 
 
+GROUPS: dict[str, tuple[str, ...]] = {}
+"""Names of several conditions that a space may be called by in place of each of them."""
+
+
 def condition_genes(names: Sequence[str] | None = None) -> tuple[Gene, ...]:
     """Genes of some conditions in their order, or of all."""
     return tuple(gene for name in (CONDITIONS if names is None else names) for gene in CONDITIONS[name].genes)
