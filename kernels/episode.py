@@ -10,15 +10,29 @@ from kernels.state import RobotStep, base_pose, base_yaw, is_too_fast, projected
 
 
 class Outcome(IntEnum):
-    """End of an episode; tilt ends episodes of training only."""
+    """End of an episode; tilt ends routes, stands and episodes of training only."""
 
     RUNNING = 0
     GOAL = 1
+    """The goal; or the end of the time of a robot that has stood or followed its route, which may leave the terrain."""
     BASE_COLLISION = 2
     TIME_OUT = 3
     OUT = 4
     INVALID = 5
     TILT = 6
+    STRAYED = 7
+    """Off the motion that a route commands."""
+
+
+class Kind(IntEnum):
+    """What a robot is asked for (:mod:`kernels.route`)."""
+
+    CROSS = 0
+    """To reach the goal."""
+    ROUTE = 1
+    """To move as a sequence of commands says."""
+    STAND = 2
+    """To stay where it is."""
 
 
 class Invalidity(IntEnum):
@@ -37,6 +51,10 @@ STEERING = ("speed", "offset", "heading")
 """Of a segment: speed [m/s], offset of the way to the left of the straight line [m], heading left of the way [rad]."""
 LOOKAHEAD = wp.constant(1.0)
 """Distance ahead of the place that a steered robot is sent to [m]."""
+FALLEN_GRAVITY_Z = wp.constant(-0.5)
+"""Projected gravity at a tilt of 60 degrees, which ends routes and stands."""
+STAND_RADIUS = wp.constant(0.5)
+"""How far from its start a robot may be that was to stand [m]."""
 PARKING_HEIGHT = wp.constant(50.0)
 """Height at which robots whose episodes have ended are kept [m]."""
 
@@ -74,6 +92,10 @@ class Task:
     """A faster robot is invalid [m/s or rad/s]."""
     overflow_mask: int
     """Solver overflow bits that make an episode invalid."""
+    max_strayed: int
+    """Control steps in a row off the commanded motion by which a route ends."""
+    stray_m: float
+    """Displacement over two seconds that lies this far from the commanded one is off it [m]."""
 
 
 @wp.struct
@@ -98,6 +120,10 @@ class Episodes:
     """Base pose at the end, world-local frame."""
     rng: wp.array[wp.uint32]
     """Random state of the next start."""
+    kind: wp.array[int]
+    """:class:`Kind` of the episode."""
+    strayed: wp.array[int]
+    """Control steps in a row in which it was off the commanded motion."""
 
 
 def make_episodes(num_envs: int, device: str | None = None) -> Episodes:
@@ -115,6 +141,7 @@ def begin_episode(env: int, episodes_out: Episodes):
     episodes_out.counted[env] = 0
     episodes_out.base_force[env] = 0.0
     episodes_out.deviation[env] = 0.0
+    episodes_out.strayed[env] = 0
     episodes_out.final_pose[env] = wp.transform_identity()
 
 
@@ -217,7 +244,9 @@ def find_invalidity(step: RobotStep, task: Task, env: int) -> int:
 
 
 @wp.func
-def judge_state(step: RobotStep, base_force: float, invalidity: int, steps: int, task: Task, env: int) -> int:
+def judge_state(
+    step: RobotStep, base_force: float, invalidity: int, steps: int, task: Task, episodes: Episodes, env: int
+) -> int:
     """Outcome of an episode after its ``steps``-th step; the gravest of several wins."""
     if invalidity != Invalidity.NONE:
         return int(Outcome.INVALID)
@@ -227,9 +256,21 @@ def judge_state(step: RobotStep, base_force: float, invalidity: int, steps: int,
         return int(Outcome.TILT)
     x = step.joint_q[env, 0]
     y = step.joint_q[env, 1]
+    is_out = x < task.lower[0] or x > task.upper[0] or y < task.lower[1] or y > task.upper[1]
+    kind = episodes.kind[env]
+    if kind != Kind.CROSS:
+        if projected_gravity(step.joint_q, env)[2] > FALLEN_GRAVITY_Z:
+            return int(Outcome.TILT)
+        if kind == Kind.ROUTE and episodes.strayed[env] >= task.max_strayed:
+            return int(Outcome.STRAYED)
+        if steps < task.max_steps and (kind == Kind.STAND or not is_out):
+            return int(Outcome.RUNNING)
+        if kind == Kind.STAND and wp.length(episodes.start[env] - wp.vec2(x, y)) > STAND_RADIUS:
+            return int(Outcome.STRAYED)
+        return int(Outcome.GOAL)
     if wp.length(task.goal - wp.vec2(x, y)) < task.goal_radius:
         return int(Outcome.GOAL)
-    if x < task.lower[0] or x > task.upper[0] or y < task.lower[1] or y > task.upper[1]:
+    if is_out:
         return int(Outcome.OUT)
     if steps >= task.max_steps:
         return int(Outcome.TIME_OUT)
@@ -253,7 +294,7 @@ def latch_outcomes(step: RobotStep, task: Task, episodes_out: Episodes):
     steps = episodes_out.steps[env] + 1
     force = wp.max(episodes_out.base_force[env], max_base_force(step, env))
     invalidity = find_invalidity(step, task, env)
-    outcome = judge_state(step, force, invalidity, steps, task, env)
+    outcome = judge_state(step, force, invalidity, steps, task, episodes_out, env)
     episodes_out.base_force[env] = 0.0
     episodes_out.deviation[env] = wp.max(episodes_out.deviation[env], distance_from_line(step.joint_q, env, task))
     episodes_out.steps[env] = steps

@@ -4,13 +4,16 @@ The scale of a penalty is its mean over those episodes on hard-random terrains t
 failure costs about 1 of each kind. Scales are measured once, before any search, and never tuned on an archive.
 """
 
+import math
 from bisect import bisect_left
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from kernels.episode import Outcome
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.level import MIN_GOAL_RATE, give_time, measure_level_ground, report_level_ground
 from qd.search.directory import RUNS
@@ -20,17 +23,18 @@ from qd.workers.crosser import Crosser
 from qd.workers.invalid import refuse_all_invalid
 from sim.controllers.spec import controller_identity, crosser_name
 from sim.crossing import CrossingCfg
-from sim.files.atomic import prepare_output, to_json, write_atomically
+from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.templates import open_templates
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.robots.stand import Standing, describe_model, stand
 from sim.robots.user import describe_inferred, write_setting
-from sim.rollout import RolloutResult
+from sim.rollout import Rollout, RolloutResult
+from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.spaces.base import MAX_HEIGHT
-from sim.terrains.spaces.registry import at_height
+from sim.terrains.spaces.registry import at_height, get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import GroundMaps, Terrains
 
 _APART = 0.05  # share by which speeds may differ
 _OFF = 0.1  # share of its command by which a speed may miss it
@@ -41,6 +45,7 @@ _ENOUGH = 200  # failing episodes that scales are means over; if there are fewer
 _MAX_ROUNDS = 5  # how often as many terrains as at first are crossed
 _HEIGHTS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, MAX_HEIGHT)  # to choose from [m]
 _CROSSED = 0.8  # share of episodes that should reach the goal
+_ROUTES = 100  # on level ground
 _TRIED = 100  # hard-random terrains at a height, one episode each: terrains differ more than their episodes
 
 
@@ -104,6 +109,40 @@ def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute, *, skip_
     else:
         report_level_ground(robot, policy, compute, must_walk=not skip_level_ground)
     return robot
+
+
+def ensure_stray(robot: RobotCfg, policy: str | None, compute: Compute) -> None:
+    """Measures how far routes may be missed, and writes it to the penalty scales, if they do not say it."""
+    content = read_json(robot.scales_file)
+    if "stray_m" not in content:
+        print(f"How well robot '{robot.name}' follows commands on level ground is measured first.", flush=True)
+        stray_m = measure_stray(robot, policy or str(robot.policy_file), compute.device)
+        write_atomically(robot.scales_file, to_json(content | {"stray_m": stray_m, "stray_routes": _ROUTES}))
+
+
+def measure_stray(robot: RobotCfg, policy: str, device: str) -> float:
+    """How far displacements over two seconds are from those commanded on level ground [m]: 99 % are nearer.
+
+    They are of hard-random routes, one episode each, at every control step before it ends.
+    """
+    space = get_space(f"{SUPER_GAUSSIAN.name}+command")
+    rows = space.condition_rows(space.hard_random(_ROUTES, 0))
+    ground = replace(GroundMaps.plain(_ROUTES), conditions=rows)
+    seeds = np.random.SeedSequence(0).generate_state(_ROUTES, np.uint32)
+    terrains = Terrains(heights=np.zeros((_ROUTES, NUM_ROWS, NUM_COLS), np.float32), seeds=seeds, ground=ground)
+    how: Any = {"num_terrains": _ROUTES, "replicas": 1, "cfg": CrossingCfg(stray_m=math.inf), "with_conditions": True}
+    rollout, errors = Rollout(robot, policy, device=device, **how), list[NDArray[np.float32]]()
+    assert rollout.trail is not None
+    trail = rollout.trail
+
+    def watch(after: bool) -> None:
+        if not after:
+            error, running = trail.error.numpy(), rollout.outcome.numpy() == Outcome.RUNNING
+            errors.append(error[running & (error > 0.0)])
+
+    rollout.watch = watch
+    rollout.evaluate(terrains)
+    return float(np.quantile(np.concatenate(errors), 0.99))
 
 
 def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:

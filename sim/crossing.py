@@ -3,15 +3,21 @@
 import math
 from dataclasses import dataclass, replace
 
+import warp as wp
+
 from kernels.episode import Task
-from kernels.launch import make_struct
+from kernels.launch import make_struct, make_zeros
 from kernels.queue import StartRanges
+from kernels.route import WINDOW_S, Trail
 from sim.robots.robot import RobotCfg
+from sim.terrains.conditions.kinds import condition_column
 
 CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 """mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 FALLEN_TILT_DEG = 60.0
 """A robot that leans further than this has fallen [degrees]."""
+PUSHES = ("push_x",)
+"""First numbers of the conditions that push robots."""
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
 _RESOLVED_DT = 0.001
@@ -46,6 +52,10 @@ class CrossingCfg:
     """Contact force on the base that counts as a collision [N]."""
     poll_every_s: float = 1.0
     """How often the host asks whether any episode still runs, in simulated time."""
+    stray_s: float = 1.0
+    """Time off its commanded motion after which a route has failed."""
+    stray_m: float | None = None
+    """Displacement over two seconds that misses the commanded one by this is off it [m]; the robot's if None."""
     reward: bool = False
     """Sum the robot's training reward too. A robot that reached the goal is then told to stand, and goes on until its
     time is over or it ends otherwise; without it, robots stop at the goal."""
@@ -69,8 +79,19 @@ def make_task(cfg: CrossingCfg, robot: RobotCfg, *, to_goal: bool = True) -> Tas
         first_counted_step=round(cfg.penalties_from_s / robot.physics_dt) + 1,
         max_speed=robot.max_speed,
         max_gravity_z=2.0,  # no tilt ends a crossing
+        stray_m=math.inf if cfg.stray_m is None else cfg.stray_m,
+        max_strayed=round(cfg.stray_s / robot.control_dt),
         overflow_mask=CAPACITY_OVERFLOWS,
     )
+
+
+def make_trail(num_envs: int, robot: RobotCfg, device: str) -> Trail:
+    """What routes of conditions need."""
+    steps = (num_envs, 1 + round(WINDOW_S / robot.control_dt))
+    trail = make_zeros(Trail, device, walked=steps, commanded=steps, age=num_envs, here=num_envs, error=num_envs)
+    trail.first = condition_column("segment_1_x")
+    trail.pushes = wp.array([condition_column(name) for name in PUSHES], dtype=int, device=device)
+    return trail
 
 
 def make_start_ranges(cfg: CrossingCfg, robot: RobotCfg) -> StartRanges:

@@ -1,5 +1,6 @@
 """The crossing task: robots cross terrains toward a goal, and what it cost them comes back."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ import torch
 import warp as wp
 
 from kernels.episode import (
+    Kind,
     Outcome,
     begin_episodes,
     command_goal,
@@ -24,12 +26,15 @@ from kernels.observation import apply_action
 from kernels.penalties import PENALTIES, add_penalties, penalty_columns
 from kernels.queue import make_queue, make_ready, ring_slices, turn_over
 from kernels.rewards import Rewards, remember_steps
+from kernels.route import follow_routes
 from sim.controllers.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.controllers.runner import Memory, PolicyRunner
-from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task
+from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task, make_trail
 from sim.recording.frames import Frames
+from sim.robots.find import read_stray
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import TerrainBank
+from sim.terrains.conditions.kinds import asked
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -142,6 +147,7 @@ class Rollout:
         episode: The episode that a robot runs: replica ``episode % replicas`` of terrain slot
             ``episode // replicas``, -1 for none; shape (num_envs,).
         outcome: :class:`kernels.episode.Outcome` of it, shape (num_envs,).
+        trail: How routes were commanded and walked (:mod:`kernels.route`); None of a bank without conditions.
         watch: Looks at these arrays before every control step (it is called with False), where a robot that has just
             taken an episode stands at its start, and after it (True), before robots take the next.
     """
@@ -222,7 +228,9 @@ class Rollout:
             self.episode = self._queue.episode_of_env
             self._ranges = make_start_ranges(self.cfg, robot)
             self._robot_step = sim.make_step(self.command, self._last_action)
-            self._task = make_task(self.cfg, robot)
+            routes = self.cfg.stray_m is None and asked(self.space.conditions) == Kind.ROUTE
+            task_cfg = replace(self.cfg, stray_m=read_stray(robot)) if routes else self.cfg
+            self._task = make_task(task_cfg, robot)
             self._episode = self._stepped = make_episodes(num_envs)
             self.outcome = self._episode.outcome
             self._latches = [(self._task, self._episode)]
@@ -233,6 +241,7 @@ class Rollout:
                 self._reward = Reward(sim, robot.training, self._robot_step, falls=(Outcome.BASE_COLLISION,))
                 self._stepped = make_episodes(num_envs)
                 self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
+            self.trail = make_trail(num_envs, robot, bank.device) if bank.conditions is not None else None
             self._rewards = Rewards() if self._reward is None else self._reward.state
             self._policy = PolicyRunner(policy, self._observation, self._action, self._queue.begins)
             self._step_graph = sim.capture(self._launch_control_step)
@@ -263,6 +272,9 @@ class Rollout:
             begin_episodes(queue.begins, self._stepped)
             remember_steps(self._last_action, sim.joint_qd, self._rewards, self._counter)
         command_goal(sim.joint_q, episode.outcome, self._task, self.command)
+        if self.trail is not None:
+            row = sim.disturbed.row
+            follow_routes(sim.joint_q, row, self._task, self.robot.control_dt, episode, self.trail, self.command)
         if queue.steering.shape[0]:
             steered = (queue.steering, queue.episode_of_env)
             command_steered(sim.joint_q, episode.outcome, *steered, self._task, self.command)
@@ -304,6 +316,9 @@ class Rollout:
         spaces = [space_key(space.name, space.sha256) for space in (terrains.space, self.space)]
         if terrains.genes is not None and spaces[0] != spaces[1]:
             raise ValueError(f"genes must be of the space {self.space.name} here, got {terrains.space.name}")
+        asks = terrains.ground is not None and (terrains.ground.rows[:, -1] == Kind.ROUTE).any()
+        if asks and self.cfg.stray_m is None:
+            raise ValueError("heights with routes need CrossingCfg.stray_m, got None: give genes of a space, or a limit")
         num_ways = 0 if terrains.steering is None else terrains.steering.shape[1]
         if num_ways != (self.replicas if self._queue.steering.shape[0] else 0):
             raise ValueError(f"terrains must have {self.replicas} ways each if with_steering, else 0, got {num_ways}")

@@ -130,12 +130,12 @@ def summarise_crossings(
         by_type = {CROSSING_TYPES[k]: summarise(types == k) for k in np.unique(types)}
     if levels is not None:
         by_level = {str(level): summarise(levels == level) for level in np.unique(levels)}
-    outcomes = [outcome for outcome in Outcome if outcome != Outcome.TILT]
+    counts = {outcome: int((result.outcome == outcome).sum()) for outcome in Outcome}
     return {
         **summarise(np.ones(len(result.outcome), bool)),
         **{f"{name}_interval": valid_interval(values, seed, None, RATES) for name, values in rates.items()},
         "episodes": int(result.outcome.size),
-        "outcomes": {outcome.name.lower(): int((result.outcome == outcome).sum()) for outcome in outcomes},
+        "outcomes": {end.name.lower(): count for end, count in counts.items() if count or end < Outcome.TILT},
         "invalid_terrains": int(np.isnan(rates["success_rate"]).sum()),
         "by_type": by_type,
         "by_level": by_level,

@@ -61,6 +61,8 @@ _WAYS = {
     Outcome.BASE_COLLISION: "hits the ground",
     Outcome.TIME_OUT: "gets stuck",
     Outcome.OUT: "leaves the terrain",
+    Outcome.TILT: "topples",
+    Outcome.STRAYED: "strays",
     Outcome.INVALID: "breaks the simulation",
 }
 
@@ -264,7 +266,7 @@ def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np
     banks = [make_heights(genes[first : first + _BANK], space, every=_EVERY) for first in range(0, len(genes), _BANK)]
     maps = np.concatenate([bank.reshape(len(bank), -1).astype(np.float64) for bank in banks])
     ranges = np.array([gene.high - gene.low for gene in condition_genes()])
-    conditions = space.condition_rows(genes) / (_KIN_SHARE * ranges)
+    conditions = space.condition_rows(genes)[:, :-1] / (_KIN_SHARE * ranges)
     height = height_over_paper(space.inner if isinstance(space, WiderSpace) else space)
     return np.maximum(rms_distances(maps, maps) / (KIN_M * height), cdist(conditions, conditions, "chebyshev"))
 

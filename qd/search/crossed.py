@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from kernels.episode import Kind
 from qd.faults.searches import check_fits, controllers_in
 from qd.faults.steer import LINE_M, SteerCfg, cross_ways, draw_ways, first_ways
 from qd.search.directory import Metrics
@@ -23,6 +24,7 @@ from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
 from sim.robots.robot import RobotCfg
+from sim.terrains.conditions.kinds import asked
 from sim.terrains.terrains import Terrains
 
 MOST = 500
@@ -50,7 +52,8 @@ class Labeller(ExitStack):
         panel = {name: file for name, file in controllers_in(robot.panel).items() if not is_searched(cfg, file, robot)}
         for name, file in panel.items():
             check_fits(name, file, robot, compute.device)
-        self._panel = list(panel.values())
+        steers = asked(cfg.terrain_space.conditions) == Kind.CROSS
+        self._walkers = [*panel.values(), *([None] if steers else [])]  # None is the searched controller
         self._hashes = {name: controller_hash(file) for name, file in panel.items()}
         if metrics and (before := metrics[-1]["panel"]) != self._hashes:
             names = ", ".join(sorted({*before} | {*self._hashes})) or "none"
@@ -71,11 +74,11 @@ class Labeller(ExitStack):
         seeds = rng.integers(2**32, size=len(rows), dtype=np.uint32)
         terrains = Terrains(genes=genes, seeds=seeds, space=self._cfg.terrain_space)
         crossed = goal_rate > 0.0
-        for number, file in enumerate([*self._panel, None]):
+        for number, file in enumerate(self._walkers):
             left = np.flatnonzero(~crossed)
 
             def move(share: float, number: int = number) -> None:
-                share = (number + share) / (len(self._panel) + 1)
+                share = (number + share) / len(self._walkers)
                 show(f"iteration {iteration}: does anybody cross what stops the robot? {share:.0%}")
 
             crosser = self._crossers[file or "" if self._on_gpu else ""]

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.check import ensure_ready
+from kernels.episode import Kind
+from qd.check import ensure_ready, ensure_stray
 from qd.faults.numbers import count_episodes
 from qd.search.archive import Archive
 from qd.search.crossed import Labeller
@@ -37,6 +38,7 @@ from sim.files.command import BEGAN, Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
+from sim.terrains.conditions.kinds import asked
 from sim.terrains.spaces.registry import at_height, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
 
@@ -61,6 +63,8 @@ def start_search(
         terrain_space = at_height(terrain_space, height)
     ready = ensure_ready(get_robot(robot), policy, compute, skip_level_ground=skip_level_ground)
     terrain_space = space_at(terrain_space, height, ready)
+    if asked(terrain_space.conditions) == Kind.ROUTE:
+        ensure_stray(ready, policy, compute)
     return preset(size, ready, policy, space=terrain_space.name, space_sha256=terrain_space.sha256), ready
 
 

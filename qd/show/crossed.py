@@ -37,6 +37,8 @@ ENDINGS = {
     Outcome.BASE_COLLISION: Ending("base collision", "#d55e00", "X", "--"),
     Outcome.TIME_OUT: Ending("out of time", "#0072b2", "s", "-."),
     Outcome.OUT: Ending("left the terrain", "#cc79a7", "^", ":"),
+    Outcome.TILT: Ending("fell", "#e69f00", "v", "--"),
+    Outcome.STRAYED: Ending("strayed from its command", "#f0e442", "D", ":"),
 }
 """How a valid episode may end, the good way first."""
 ARRIVED, *FAILED = (ending.label for ending in ENDINGS.values())

@@ -205,7 +205,8 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
     outcome = recording.outcome[0]
     valid = outcome != Outcome.INVALID
     count = int(valid.sum())
-    outcomes = {o.name.lower(): int((outcome == o).sum()) for o in Outcome if 0 < o < Outcome.TILT}
+    counts = {end: int((outcome == end).sum()) for end in Outcome if end}
+    outcomes = {end.name.lower(): count for end, count in counts.items() if count or end < Outcome.TILT}
     fallen = int(recording.fallen[0, valid].sum())
     hits = {"success": count - outcomes["base_collision"], "goal": outcomes["goal"], "fallen": fallen}
     return {

@@ -1,5 +1,6 @@
 """Crossings in plain MuJoCo C, one after another."""
 
+import math
 from collections import deque
 from collections.abc import Callable
 from copy import copy
@@ -11,7 +12,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from kernels.episode import Invalidity, Outcome, make_episodes
+from kernels.episode import FALLEN_GRAVITY_Z, STAND_RADIUS, Invalidity, Kind, Outcome, make_episodes
 from kernels.launch import make_struct, make_zeros
 from kernels.observation import ACTION_LIMIT, Sensors
 from kernels.penalties import PENALTIES, penalty_columns
@@ -23,6 +24,7 @@ from sim.controllers.runner import reset_all
 from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, find_highest_command, make_start_ranges
 from sim.mujoco_c.model import (
     NO_SOFTNESS,
+    Routes,
     Starts,
     crossing_model,
     distances_from_line,
@@ -33,6 +35,7 @@ from sim.mujoco_c.model import (
 )
 from sim.robots.actuator_net import ActuatorNet, Array
 from sim.robots.compiled import mj, robot_spec
+from sim.robots.find import read_stray
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.bank import TerrainBank, make_terrains
@@ -131,14 +134,33 @@ class EpisodeStates:
         return rows
 
 
-def _judge(robot: RobotCfg, episodes: EpisodeStates, running: NDArray[np.intp], base: NDArray[np.bool_]) -> Array:
-    """Outcome of each running episode after a physics step, the gravest of several."""
+def _judge(
+    robot: RobotCfg,
+    episodes: EpisodeStates,
+    running: NDArray[np.intp],
+    base: NDArray[np.bool_],
+    routes: Routes,
+    starts: Starts,
+    *,
+    ends: bool,
+) -> Array:
+    """Outcome of each running episode after a physics step, the gravest of several; its time ``ends``, or not."""
     cfg = CrossingCfg
     qpos = episodes.qpos[running]
     position = qpos[:, :2]
-    outcome = np.full(len(running), Outcome.RUNNING)
-    outcome[((position < cfg.lower) | (position > cfg.upper)).any(axis=1)] = Outcome.OUT
-    outcome[np.hypot(*(cfg.goal - position).T) < cfg.goal_radius] = Outcome.GOAL
+    outcome = np.full(len(running), Outcome.TIME_OUT if ends else Outcome.RUNNING)
+    out = ((position < cfg.lower) | (position > cfg.upper)).any(axis=1)
+    if routes.kind == Kind.CROSS:
+        outcome[out] = Outcome.OUT
+        outcome[np.hypot(*(cfg.goal - position).T) < cfg.goal_radius] = Outcome.GOAL
+    else:
+        if routes.kind == Kind.ROUTE:
+            outcome[out | ends] = Outcome.GOAL
+            outcome[routes.strayed[running] >= round(cfg.stray_s / robot.control_dt)] = Outcome.STRAYED
+        elif ends:
+            near = np.hypot(*(starts.qpos[running, :2] - position).T) <= float(STAND_RADIUS)
+            outcome[:] = np.where(near, Outcome.GOAL, Outcome.STRAYED)
+        outcome[2.0 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2) - 1.0 > float(FALLEN_GRAVITY_Z)] = Outcome.TILT
     force = np.linalg.norm(episodes.forces[running][:, base], axis=2).max(axis=1)
     outcome[force > cfg.base_force] = Outcome.BASE_COLLISION
     finite = np.isfinite(qpos).all(axis=1) & (np.abs(episodes.qvel[running]) <= robot.max_speed).all(axis=1)
@@ -178,6 +200,9 @@ def cross_in_mujoco_c(
     remembers = reset_all(policy, count)  # it must be asked for the same robots every time
     max_steps = round(robot.max_duration_s / robot.physics_dt)
     highest = find_highest_command(CrossingCfg(), robot)
+    row = nominal_row() if ground is None else ground.rows[0]
+    stray_m = read_stray(robot) if row[-1] == Kind.ROUTE else math.inf
+    routes = Routes(robot, row.astype(np.float64), count, stray_m)
     for step in range(max_steps):
         if len(running := np.flatnonzero(outcome == Outcome.RUNNING)) == 0:
             break
@@ -185,6 +210,8 @@ def cross_in_mujoco_c(
             qpos = episodes.qpos[running]
             command = np.zeros((count, 3))
             command[running] = goal_commands(qpos, robot.speed)
+            if routes.kind != Kind.CROSS:
+                command[running] = routes.command(episodes.qpos, step * robot.physics_dt)[running]
             if steering is not None:
                 steered = running[~np.isnan(steering[running, 0, 0])]
                 command[steered] = steered_commands(episodes.qpos[steered], steering[steered], highest)
@@ -202,8 +229,7 @@ def cross_in_mujoco_c(
             last_action[running] = action
             episodes.targets[running] = default + robot.action_scale * action
         episodes.step(running)
-        judged = _judge(robot, episodes, running, base)
-        judged[(judged == Outcome.RUNNING) & (step + 1 >= max_steps)] = Outcome.TIME_OUT
+        judged = _judge(robot, episodes, running, base, routes, starts, ends=step + 1 >= max_steps)
         outcome[running] = judged
         steps[running] += 1
         deviation[running] = np.maximum(deviation[running], distances_from_line(episodes.qpos[running]))

@@ -14,12 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import LOOKAHEAD, SEGMENTS
+from kernels.episode import LOOKAHEAD, SEGMENTS, Kind
 from kernels.ground import FIRM
 from kernels.penalties import PENALTIES, PlainStep
-from sim.crossing import GROUND_FRICTION, CrossingCfg
+from kernels.route import CALM_S, LEAST_SPEED, WINDOW_S
+from kernels.route import SEGMENTS as ROUTE_SEGMENTS
+from sim.crossing import GROUND_FRICTION, CrossingCfg, find_highest_command
 from sim.robots.compiled import mj, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
+from sim.terrains.conditions.kinds import condition_genes
 from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.heightmap import QUARTER_TURN, Margins, as_hfield
 from sim.terrains.terrains import PATCHES, GroundMaps
@@ -248,6 +251,49 @@ def steered_commands(qpos: Array, steering: NDArray[np.floating], highest: Seque
     turn = CrossingCfg.yaw_gain * _wrap(error + heading)
     commands = np.stack([speed * np.cos(error), speed * np.sin(error), turn], axis=1)
     return np.clip(commands, CrossingCfg.lowest_command, highest)
+
+
+class Routes:
+    """Commands of robots that are to follow a route or to stand, and how far they are off it, by control steps."""
+
+    def __init__(self, robot: RobotCfg, row: Array, count: int, stray_m: float) -> None:
+        """``row`` are conditions of a terrain with ``count`` robots, ``stray_m`` how far they may miss it [m]."""
+        self.kind, self._robot, self._stray_m = Kind(int(row[-1])), robot, stray_m
+        values = {gene.name: value for gene, value in zip(condition_genes(), row, strict=False)}
+        names = ([f"segment_{k + 1}_{axis}" for axis in ("x", "y", "turn")] for k in range(ROUTE_SEGMENTS))
+        self._segments = np.array([[values[name] for name in segment] for segment in names])
+        self._pushed_s = [values["push_time"]] if values["push_x"] or values["push_y"] else []
+        self._walked, self._told = list[Array](), [np.zeros((count, 3))]
+        self.strayed = np.zeros(count, int)
+
+    def command(self, qpos: Array, time_s: float) -> Array:
+        """Commands of all robots for the next control step, (count, 3); the steps in a row off the route are counted."""
+        robot = self._robot
+        self._walked.append(np.column_stack([qpos[:, :2], _heading(qpos)]))
+        window = round(WINDOW_S / robot.control_dt)
+        if len(self._walked) > window:
+            ours, theirs = (_moves(poses[-1 - window], poses[-1]) for poses in (self._walked, self._told))
+            off = np.linalg.norm(ours - theirs, axis=1) > self._stray_m
+            if not any(0.0 <= time_s - pushed < float(CALM_S) for pushed in self._pushed_s):
+                self.strayed = np.where(off, self.strayed + 1, 0)
+        command = np.zeros(3)
+        if self.kind == Kind.ROUTE:
+            x, y, turn = self._segments[min(int(time_s / robot.max_duration_s * ROUTE_SEGMENTS), ROUTE_SEGMENTS - 1)]
+            moves = robot.speed * (np.hypot(x, y) >= float(LEAST_SPEED))
+            command = np.array([moves * x, moves * y, turn * (abs(turn) >= float(LEAST_SPEED))])
+            command = np.clip(command, CrossingCfg.lowest_command, find_highest_command(CrossingCfg(), robot))
+        here, dt = self._told[-1], robot.control_dt
+        yaw = here[:, 2] + 0.5 * dt * command[2]
+        ahead, aside = np.stack([np.cos(yaw), np.sin(yaw)]), np.stack([-np.sin(yaw), np.cos(yaw)])
+        moved = dt * (command[0] * ahead + command[1] * aside)
+        self._told.append(here + np.column_stack([moved.T, np.full(len(here), dt * command[2])]))
+        return np.tile(command, (len(qpos), 1))
+
+
+def _moves(before: Array, after: Array) -> Array:
+    """Displacements between poses, x, y [m] and yaw, (count, 3), in the frames of the first; shape (count, 2)."""
+    (x, y), yaw = (after[:, :2] - before[:, :2]).T, before[:, 2]
+    return np.column_stack([np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x])
 
 
 def distances_from_line(qpos: Array) -> Array:

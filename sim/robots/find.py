@@ -68,6 +68,15 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
         raise ValueError(f"{robot.scales_file} needs a positive scale for {names}: {error}; {remedy}") from None
 
 
+def read_stray(robot: RobotCfg) -> float:
+    """How far a displacement over two seconds may lie from the one that a route commands [m] (``qd.check``)."""
+    content = read_json(robot.scales_file) if robot.scales_file.exists() else {}
+    if "stray_m" not in content:
+        remedy = f"run `{command_line('archive', robot=robot.spec, space='super_gaussian+command')}`"
+        raise ValueError(f"{robot.scales_file} must say how far a route may be missed, got no stray_m: {remedy} first")
+    return float(content["stray_m"])
+
+
 def fitting_space(robot: RobotCfg) -> str | None:
     """The terrain space that the robot's scales were measured on, whose height fits it; None of a shipped robot."""
     if robot.settings_file is None or not robot.scales_file.exists():

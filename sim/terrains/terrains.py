@@ -37,10 +37,10 @@ class GroundMaps:
         if len(self.friction) != len(self.time_constant_s):
             got = f"{len(self.friction)} of friction and {len(self.time_constant_s)} of softness"
             raise ValueError(f"maps must be of as many terrains, got {got}")
-        genes = condition_genes()
-        if self.rows.shape != (len(self), len(genes)):
-            raise ValueError(f"conditions must have shape ({len(self)}, {len(genes)}), got {self.rows.shape}")
-        for gene, values in zip(genes, self.rows.T, strict=True):
+        genes, expected = condition_genes(), (len(self), len(nominal_row()))
+        if self.rows.shape != expected:
+            raise ValueError(f"conditions must have shape {expected}, got {self.rows.shape}")
+        for gene, values in zip(genes, self.rows.T[:-1], strict=True):
             low, high = gene.limits
             wrong = ~((values >= low - 1e-6) & (values <= high + 1e-6))
             if wrong.any():

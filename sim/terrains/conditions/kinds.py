@@ -1,7 +1,8 @@
 """What a condition is, and all conditions by name: each in the parallel simulation and in MuJoCo C.
 
 A condition has genes in [-1, 1], each of which becomes one number. The numbers of all conditions, in the order in which
-they are registered, are the row of conditions of a terrain.
+they are registered, are the row of conditions of a terrain. Behind them stands what the robot is asked for, a
+:class:`kernels.episode.Kind`.
 """
 
 from collections import deque
@@ -14,7 +15,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from kernels.conditions import BASE, DisturbedStep, VariedRobots
-from kernels.episode import Outcome
+from kernels.episode import Kind, Outcome
 from sim.robots.training import NoiseCfg
 from sim.terrains.quantities import Quantity, Sweep
 
@@ -50,16 +51,16 @@ class Gene(Quantity):
 class Condition:
     """A condition under which robots cross. A class and its instance in :data:`CONDITIONS` add one."""
 
-    name: ClassVar[str]
+    name: str
     """What a space is called by it: ``course+payload``."""
-    cause: ClassVar[str]
+    cause: str
     """What a fault is called that it causes."""
-    genes: ClassVar[tuple[Gene, ...]]
+    genes: tuple[Gene, ...]
     form: ClassVar[str]
     """Its values as text."""
     least: ClassVar[float]
     """What its first value differs by from the nominal one, or nothing is said of it."""
-    dose: ClassVar[Sweep | None] = None
+    dose: Sweep | None = None
     """One of its genes as a dose on level ground."""
     varied: ClassVar[tuple[float, float] | None] = None
     """Limits between which its first value is drawn for varied conditions; None if it stays nominal."""
@@ -69,6 +70,8 @@ class Condition:
     """Warp function that disturbs a control step."""
     disturbs_last: ClassVar[bool] = False
     """Whether it disturbs what others have disturbed."""
+    asks: ClassVar[Kind] = Kind.CROSS
+    """What the robots of a space with it are asked for."""
 
     def text(self, values: Array) -> str:
         """Its values in a few words; empty where it changes nothing to speak of."""
@@ -110,14 +113,19 @@ def condition_column(name: str) -> int:
 
 
 def nominal_row() -> NDArray[np.float32]:
-    """A row of conditions that change nothing."""
-    return np.array([gene.to_value(gene.absent) for gene in condition_genes()], np.float32)
+    """A row of conditions that change nothing, of a crossing."""
+    return np.array([*(gene.to_value(gene.absent) for gene in condition_genes()), Kind.CROSS], np.float32)
+
+
+def asked(names: Sequence[str]) -> Kind:
+    """What robots are asked for under some conditions."""
+    return max((CONDITIONS[name].asks for name in names), default=Kind.CROSS)
 
 
 def split_row(row: Array) -> list[tuple[Condition, Array]]:
     """Each condition with its numbers in a row."""
     ends = np.cumsum([len(condition.genes) for condition in CONDITIONS.values()])
-    return list(zip(CONDITIONS.values(), np.split(row, ends[:-1]), strict=True))
+    return list(zip(CONDITIONS.values(), np.split(row, ends)[:-1], strict=True))
 
 
 def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str]:
@@ -128,9 +136,8 @@ def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str
 
 def condition_effects(stage: Literal["begin", "disturb"]) -> tuple[tuple[Any, int], ...]:
     """Warp functions of a stage in the order in which they act, each with its first column in a row."""
-    columns = sorted(split_row(np.arange(len(condition_genes()))), key=lambda pair: pair[0].disturbs_last)
-    effects = ((getattr(condition, stage), int(first)) for condition, (first, *_) in columns)
-    return tuple((function, first) for function, first in effects if function)
+    columns = sorted(split_row(np.arange(len(nominal_row()))), key=lambda pair: pair[0].disturbs_last)
+    return tuple((effect, int(own[0])) for condition, own in columns if (effect := getattr(condition, stage)))
 
 
 def round_steps(seconds: float, dt: float) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
-from sim.terrains.conditions.kinds import CONDITIONS, condition_column, condition_genes, condition_texts
+from sim.terrains.conditions.kinds import CONDITIONS, asked, condition_column, condition_genes, condition_texts
 from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
 from sim.terrains.terrains import GROUND_KINDS, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
 
@@ -67,6 +67,7 @@ class WiderSpace(TerrainSpace):
         rows = super().condition_rows(genes)
         for gene, values in zip(kinds, columns, strict=True):
             rows[:, condition_column(gene.name)] = gene.to_value(values)
+        rows[:, -1] = asked(self.conditions)
         return rows
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
