@@ -83,9 +83,9 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     @staticmethod
     def help_values() -> dict[str, str]:
         """Names of conditions."""
-        from sim.terrains.conditions.kinds import CONDITIONS, GROUPS
+        from sim.terrains.conditions.kinds import CONDITIONS, GROUPS, TASKS
 
-        return {"conditions": ", ".join(f"+{name}" for name in (*CONDITIONS, *GROUPS))}
+        return {"conditions": ", ".join(f"+{name}" for name in (*CONDITIONS, *GROUPS, *TASKS))}
 
     @classmethod
     def defaults(cls, argv: Sequence[str]) -> Self:

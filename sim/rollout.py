@@ -1,6 +1,5 @@
 """The crossing task: robots cross terrains toward a goal, and what it cost them comes back."""
 
-import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -34,7 +33,6 @@ from sim.recording.frames import Frames
 from sim.robots.find import read_stray
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import TerrainBank
-from sim.terrains.conditions.kinds import asked
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -186,7 +184,7 @@ class Rollout:
         self.space = space
         self.watch: Callable[[bool], None] | None = None
         with_ground |= bool(space.ground)
-        with_conditions |= bool(space.conditions)
+        with_conditions |= space.has_conditions
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         try:
@@ -228,7 +226,7 @@ class Rollout:
             self.episode = self._queue.episode_of_env
             self._ranges = make_start_ranges(self.cfg, robot)
             self._robot_step = sim.make_step(self.command, self._last_action)
-            routes = self.cfg.stray_m is None and asked(self.space.conditions) == Kind.ROUTE
+            routes = self.cfg.stray_m is None and self.space.asks == Kind.ROUTE
             task_cfg = replace(self.cfg, stray_m=read_stray(robot)) if routes else self.cfg
             self._task = make_task(task_cfg, robot)
             self._episode = self._stepped = make_episodes(num_envs)
@@ -318,7 +316,7 @@ class Rollout:
             raise ValueError(f"genes must be of the space {self.space.name} here, got {terrains.space.name}")
         asks = terrains.ground is not None and (terrains.ground.rows[:, -1] == Kind.ROUTE).any()
         if asks and self.cfg.stray_m is None:
-            raise ValueError("heights with routes need CrossingCfg.stray_m, got None: give genes of a space, or a limit")
+            raise ValueError("heights with routes need CrossingCfg.stray_m, got None: give it, or genes of a space")
         num_ways = 0 if terrains.steering is None else terrains.steering.shape[1]
         if num_ways != (self.replicas if self._queue.steering.shape[0] else 0):
             raise ValueError(f"terrains must have {self.replicas} ways each if with_steering, else 0, got {num_ways}")

@@ -321,7 +321,7 @@ def make_pack(
 
 def _read_judged(search: Search) -> Archive:
     """The archive of a search of heights alone; refuses one that is not judged by all stages that a pack needs."""
-    if search.space.ground or search.space.conditions:
+    if search.space.ground or search.space.has_conditions:
         got = f"terrains of {search.space.name}, which have ground or conditions of their own"
         raise ValueError(f"a pack holds heights alone, got {got}")
     archive = search.read_archive()

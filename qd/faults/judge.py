@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.sets import plain_set
 from kernels.episode import Kind
+from qd.evaluate.sets import plain_set
 from qd.faults.families import find_failing_causes, find_families, judged_numbers
 from qd.faults.numbers import (
     EPISODES,
@@ -42,7 +42,6 @@ from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.mujoco_c.model import NO_SOFTNESS
 from sim.rollout import RolloutResult
-from sim.terrains.conditions.kinds import asked
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import at_height
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -230,8 +229,9 @@ class Steered(Stage):
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with witnesses of its confirmed elites that no controller certifies, at first one a family."""
         search, crosser = judging.search, judging.crosser
-        if asked(search.space.conditions) != Kind.CROSS:
-            raise ValueError(f"no way is sought where robots are told how to move, got {search.space.name}: leave it out")
+        if search.space.asks != Kind.CROSS:
+            problem = f"no way is sought where robots are told how to move, as in {search.space.name}"
+            raise ValueError(f"{problem}: leave the stage steered out")
         open_cases = archive.confirmed if archive.resolved_outcomes.any() else archive.failing
         first, others = split_families(archive, np.flatnonzero(open_cases & ~archive.certified_by_controllers))
         rows = np.sort(np.concatenate([np.sort(first), others])[: judging.most_steered])

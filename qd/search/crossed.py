@@ -24,7 +24,6 @@ from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
 from sim.robots.robot import RobotCfg
-from sim.terrains.conditions.kinds import asked
 from sim.terrains.terrains import Terrains
 
 MOST = 500
@@ -52,7 +51,7 @@ class Labeller(ExitStack):
         panel = {name: file for name, file in controllers_in(robot.panel).items() if not is_searched(cfg, file, robot)}
         for name, file in panel.items():
             check_fits(name, file, robot, compute.device)
-        steers = asked(cfg.terrain_space.conditions) == Kind.CROSS
+        steers = cfg.terrain_space.asks == Kind.CROSS
         self._walkers = [*panel.values(), *([None] if steers else [])]  # None is the searched controller
         self._hashes = {name: controller_hash(file) for name, file in panel.items()}
         if metrics and (before := metrics[-1]["panel"]) != self._hashes:

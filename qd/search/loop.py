@@ -38,7 +38,6 @@ from sim.files.command import BEGAN, Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.conditions.kinds import asked
 from sim.terrains.spaces.registry import at_height, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
 
@@ -63,7 +62,7 @@ def start_search(
         terrain_space = at_height(terrain_space, height)
     ready = ensure_ready(get_robot(robot), policy, compute, skip_level_ground=skip_level_ground)
     terrain_space = space_at(terrain_space, height, ready)
-    if asked(terrain_space.conditions) == Kind.ROUTE:
+    if terrain_space.asks == Kind.ROUTE:
         ensure_stray(ready, policy, compute)
     return preset(size, ready, policy, space=terrain_space.name, space_sha256=terrain_space.sha256), ready
 

@@ -34,7 +34,7 @@ def export_elites(
     """
     archive = opened_run.archive
     space = opened_run.space
-    if space.conditions:
+    if space.has_conditions:
         got = f"terrains of {archive.space}, which are crossed under conditions: replay or film them instead"
         raise ValueError(f"a terrain file holds heights and ground, got {got}")
     terrains = opened_run.terrains(elite, minimal)

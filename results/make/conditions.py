@@ -27,7 +27,7 @@ from sim.terrains.terrains import Terrains
 EPISODES_SEARCHED = 400_000
 _EXAMPLES = 2
 """Of each kind of condition."""
-SPACE = "+".join((SUPER_GAUSSIAN.name, *CONDITIONS))
+SPACE = "+".join((SUPER_GAUSSIAN.name, *(name for name, kind in CONDITIONS.items() if not kind.asks)))
 _PUBLISHED = (*ARCHIVE_FILES, "minimal.npz", "minimal.json")
 
 

@@ -267,7 +267,7 @@ class Routes:
         self.strayed = np.zeros(count, int)
 
     def command(self, qpos: Array, time_s: float) -> Array:
-        """Commands of all robots for the next control step, (count, 3); the steps in a row off the route are counted."""
+        """Commands of all robots for the next control step, (count, 3); counts their steps in a row off the route."""
         robot = self._robot
         self._walked.append(np.column_stack([qpos[:, :2], _heading(qpos)]))
         window = round(WINDOW_S / robot.control_dt)

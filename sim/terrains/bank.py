@@ -124,8 +124,9 @@ def make_terrains(
     None.
     """
     device = device or host_device()
-    maps = {"with_ground": bool(space.ground), "with_conditions": bool(space.conditions)}
+    terrains = Terrains(genes=genes, seeds=np.zeros(len(genes), np.uint32), space=space)
+    maps = {"with_ground": terrains.has_ground, "with_conditions": terrains.has_conditions}
     bank = TerrainBank(len(genes), device=device, **maps)
     with wp.ScopedDevice(device):
-        bank.set(Terrains(genes=genes, seeds=np.zeros(len(genes), np.uint32), space=space))
+        bank.set(terrains)
         return np.array(bank.heights.numpy()), bank.ground_maps()

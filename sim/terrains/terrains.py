@@ -142,7 +142,7 @@ class Terrains:
     @property
     def has_conditions(self) -> bool:
         """Whether they are crossed under conditions."""
-        return bool(self.space.conditions) if self.ground is None else self.ground.conditions is not None
+        return self.space.has_conditions if self.ground is None else self.ground.conditions is not None
 
     def __len__(self) -> int:
         return len(self.seeds)

@@ -9,6 +9,7 @@ import warp as wp
 from kernels.episode import (
     SEGMENTS,
     Invalidity,
+    Kind,
     Outcome,
     begin_episodes,
     command_goal,
@@ -87,7 +88,7 @@ def test_outcomes_equal_the_oracle():
     outcomes = latch((q, qd), make_state(num_envs, steps=steps), force=force, overflow=overflow)
     expected = [expected_outcome(*row) for row in zip(q, qd, force, overflow, steps + 1, strict=True)]
     assert [outcome.name for outcome in outcomes] == expected
-    assert set(outcomes) == set(Outcome) - {Outcome.TILT}
+    assert set(outcomes) == set(Outcome) - {Outcome.TILT, Outcome.STRAYED}
 
 
 def test_an_ended_episode_stays_ended():
@@ -372,3 +373,32 @@ def test_masked_rows_are_cleared_whole(columns):
     rows = wp.array(np.full((3, columns), np.nan, np.float32))
     clear_rows(wp.array([1, 0, 7], dtype=int), rows)
     assert not rows.numpy()[[0, 2]].any() and np.isnan(rows.numpy()[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "outcome"),
+    [
+        (Kind.ROUTE, {}, Outcome.RUNNING),
+        (Kind.ROUTE, {"ends": True}, Outcome.GOAL),
+        (Kind.ROUTE, {"x": 14.0}, Outcome.RUNNING),  # the goal of crossings
+        (Kind.ROUTE, {"x": 18.5}, Outcome.GOAL),
+        (Kind.ROUTE, {"strayed": 50}, Outcome.STRAYED),
+        (Kind.ROUTE, {"strayed": 49}, Outcome.RUNNING),
+        (Kind.ROUTE, {"tilt": 1.1, "ends": True}, Outcome.TILT),
+        (Kind.STAND, {"ends": True}, Outcome.GOAL),
+        (Kind.STAND, {"x": 2.6, "ends": True}, Outcome.STRAYED),
+        (Kind.STAND, {"x": 2.6}, Outcome.RUNNING),
+        (Kind.STAND, {"strayed": 50}, Outcome.RUNNING),
+        (Kind.CROSS, {"x": 14.0}, Outcome.GOAL),
+        (Kind.CROSS, {"tilt": 1.1, "strayed": 50}, Outcome.RUNNING),
+    ],
+)
+def test_how_an_episode_ends_depends_on_what_was_asked_for(kind, changes, outcome):
+    joint_q, joint_qd = upright(1, 1, x=changes.get("x", 2.0))
+    tilt = changes.get("tilt", 0.0)
+    joint_q[:, 3:7] = np.sin(tilt / 2), 0.0, 0.0, np.cos(tilt / 2)
+    state = make_state(1, steps=MAX_STEPS - 1 if changes.get("ends") else 10)
+    state.kind.fill_(int(kind))
+    state.strayed.fill_(changes.get("strayed", 0))
+    state.start.assign(np.array([[2.0, 4.0]], np.float32))
+    assert latch((joint_q, joint_qd), state) == [outcome]

@@ -1,6 +1,4 @@
-"""Conditions under which robots cross, which belong to a terrain: payload, weak motors, delays, noise, pushes, and
-errors of what the robot sees, commands.
-"""
+"""Conditions under which robots cross, which belong to a terrain: payload, delays, noise, pushes, commands and more."""
 
 from sim.terrains.conditions import command, kinds
 

@@ -1,4 +1,4 @@
-"""What a robot is asked for in place of reaching the goal: to follow a sequence of commands, or to stand."""
+"""Routes: a robot is asked to follow a sequence of commands, which are genes, in place of reaching the goal."""
 
 import math
 
@@ -45,17 +45,6 @@ class Segment(Condition):
         return f"part {self._number} of {SEGMENTS} of the route: {', '.join(words) or 'stop'}"
 
 
-class Stand(Condition):
-    """No command: the robot stays up, and within half a metre of its start, until its time is over."""
-
-    name, cause = "stand", "command"
-    genes = ()
-    asks = Kind.STAND
-
-    def text(self, values: Array) -> str:
-        """What it is asked for."""
-        return "told to stand"
-
-
-CONDITIONS.update((kind.name, kind) for kind in (*map(Segment, range(1, SEGMENTS + 1)), Stand()))
-GROUPS["command"] = tuple(f"segment_{number}" for number in range(1, SEGMENTS + 1))
+_SEGMENTS = {segment.name: segment for segment in map(Segment, range(1, SEGMENTS + 1))}
+CONDITIONS.update(_SEGMENTS)
+GROUPS["command"] = tuple(_SEGMENTS)

@@ -102,6 +102,10 @@ GROUPS: dict[str, tuple[str, ...]] = {}
 """Names of several conditions that a space may be called by in place of each of them."""
 
 
+TASKS = {"stand": Kind.STAND}
+"""What robots are asked for without any gene, by its name in that of a space."""
+
+
 def condition_genes(names: Sequence[str] | None = None) -> tuple[Gene, ...]:
     """Genes of some conditions in their order, or of all."""
     return tuple(gene for name in (CONDITIONS if names is None else names) for gene in CONDITIONS[name].genes)
@@ -115,11 +119,6 @@ def condition_column(name: str) -> int:
 def nominal_row() -> NDArray[np.float32]:
     """A row of conditions that change nothing, of a crossing."""
     return np.array([*(gene.to_value(gene.absent) for gene in condition_genes()), Kind.CROSS], np.float32)
-
-
-def asked(names: Sequence[str]) -> Kind:
-    """What robots are asked for under some conditions."""
-    return max((CONDITIONS[name].asks for name in names), default=Kind.CROSS)
 
 
 def split_row(row: Array) -> list[tuple[Condition, Array]]:

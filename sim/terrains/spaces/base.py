@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kernels.episode import Kind
 from kernels.ground import Ground
 from sim.terrains.conditions.kinds import nominal_row
 from sim.terrains.hand_crafted import Seed
@@ -35,8 +36,15 @@ class TerrainSpace:
     """Maps that its terrains have beside heights, some of :data:`sim.terrains.terrains.GROUND_KINDS`."""
     conditions: tuple[str, ...] = ()
     """Conditions that it has genes of, some of :data:`sim.terrains.conditions.kinds.CONDITIONS`."""
+    asks: Kind = Kind.CROSS
+    """What its robots are asked for."""
     height_share: float = 1.0
     """Its highest terrain over that of the shipped heights; 1 of a user's space."""
+
+    @property
+    def has_conditions(self) -> bool:
+        """Whether its terrains are crossed under conditions, or robots are asked for something else there."""
+        return bool(self.conditions) or self.asks != Kind.CROSS
 
     def rasterise(self, genes: Any, spacing: float, heights_out: Any, *origin: float) -> None:
         """Turns genes, floats of shape (num_terrains, num_genes), clipped to [-1, 1], into heights on the device.

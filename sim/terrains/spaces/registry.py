@@ -17,7 +17,7 @@ from sim.controllers.spec import ControllerSpec, controller_hash, import_object,
 from sim.device import host_device
 from sim.robots.find import fitting_space
 from sim.robots.robot import RobotCfg
-from sim.terrains.conditions.kinds import CONDITIONS, GROUPS
+from sim.terrains.conditions.kinds import CONDITIONS, GROUPS, TASKS
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.spaces.base import MAX_HEIGHT, Seed, ShippedSpace, TerrainSpace, clipped
 from sim.terrains.spaces.course import COURSE
@@ -166,12 +166,12 @@ def find_user_space(name: str, sha256: str | None) -> UserSpace:
 def split_name(name: str) -> tuple[str, tuple[str, ...]]:
     """The name of a space without its ground and conditions, and these: ``course+friction`` is of ``course``."""
     base, named = _name_kinds(name)
-    return base, tuple(kind for kind in (*GROUND_KINDS, *CONDITIONS) if kind in named)
+    return base, tuple(kind for kind in (*GROUND_KINDS, *CONDITIONS, *TASKS) if kind in named)
 
 
 def _name_kinds(name: str) -> tuple[str, list[str]]:
     """The name of a space without its ground and conditions, and all of these that it names, a group by its members."""
-    groups = {kind: (kind,) for kind in (*GROUND_KINDS, *CONDITIONS)} | GROUPS
+    groups = {kind: (kind,) for kind in (*GROUND_KINDS, *CONDITIONS, *TASKS)} | GROUPS
     base, named = name, list[str]()
     while (split := base.rpartition("+"))[0] and split[2] in groups:
         base = split[0]
@@ -194,9 +194,9 @@ def space_key(name: str, sha256: str | None) -> str:
 def load_space(name: str | None) -> TerrainSpace:
     """A space that the command line names; a user's code is run, and :func:`get_space` finds it from then on.
 
-    A name is a shipped space's, ``file.py:Space`` or ``module:Space``, a class without arguments, and behind it ground
-    and conditions, as in ``course+friction+push``, or a group of them; None is the paper's space. All of a user's space is tried on three
-    terrains. Code that was loaded before, and has not changed, is not run again.
+    A name is a shipped space's, ``file.py:Space`` or ``module:Space``, a class without arguments, and behind it ground,
+    conditions, groups of these and a task, as in ``course+friction+push``; None is the paper's space. All of a user's
+    space is tried on three terrains. Code that was loaded before, and has not changed, is not run again.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
     once = "+".join((base, *kinds))
@@ -240,7 +240,7 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     elif is_user_space(base):
         space = find_user_space(base, sha256)
     else:
-        kinds_text = ", ".join(f"+{kind}" for kind in (*GROUND_KINDS, *CONDITIONS, *GROUPS))
+        kinds_text = ", ".join(f"+{kind}" for kind in (*GROUND_KINDS, *CONDITIONS, *TASKS, *GROUPS))
         expected = f"one of {', '.join(SPACES)}, or file.py:CLASS, and behind it some of {kinds_text}"
         raise ValueError(f"unknown terrain space '{name}': expected {expected}")
     ground = [kind for kind in kinds if kind in GROUND_KINDS]

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kernels.episode import Kind
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
-from sim.terrains.conditions.kinds import CONDITIONS, asked, condition_column, condition_genes, condition_texts
+from sim.terrains.conditions.kinds import CONDITIONS, TASKS, condition_column, condition_genes, condition_texts
 from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
 from sim.terrains.terrains import GROUND_KINDS, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
 
@@ -29,13 +30,18 @@ class WiderSpace(TerrainSpace):
     """
 
     def __init__(self, inner: TerrainSpace, kinds: tuple[str, ...]) -> None:
-        """``kinds`` are some of :data:`sim.terrains.terrains.GROUND_KINDS`, then conditions, in their order."""
+        """``kinds`` are some of the ground's, of conditions and of tasks, in the order of their tables."""
         self.inner, self.kinds, self.name = inner, kinds, "+".join((inner.name, *kinds))
         for name in ("sha256", "sigma0", "any_spacing", "height_share", "genes_per_part"):
             setattr(self, name, getattr(inner, name))
         self.maps = tuple(kind for kind in kinds if kind in GROUND_KINDS)
         self.ground = self.maps or inner.ground
         self.conditions = tuple(kind for kind in kinds if kind in CONDITIONS)
+        asked = {TASKS[kind] for kind in kinds if kind in TASKS}
+        asked |= {CONDITIONS[kind].asks for kind in self.conditions} - {Kind.CROSS}
+        if len(asked) > 1:
+            raise ValueError(f"robots must be asked for one thing, got {self.name}: leave +stand or +command out")
+        self.asks = next(iter(asked), Kind.CROSS)
         if self.maps and inner.genes_per_part and NUM_PATCHES % inner.genes_per_part:
             self.genes_per_part = None  # maps must divide by the parts of the space, too
         self._absent = [np.array([_ABSENT[kind]]) for kind in self.maps for _ in range(NUM_PATCHES)]
@@ -67,7 +73,7 @@ class WiderSpace(TerrainSpace):
         rows = super().condition_rows(genes)
         for gene, values in zip(kinds, columns, strict=True):
             rows[:, condition_column(gene.name)] = gene.to_value(values)
-        rows[:, -1] = asked(self.conditions)
+        rows[:, -1] = self.asks
         return rows
 
     def hard_random(self, count: int, seed: Seed) -> NDArray[np.float32]:
@@ -170,7 +176,8 @@ def varied_space(space: TerrainSpace) -> TerrainSpace:
     """The space whose terrains are those of another one under varied conditions."""
     inner, maps = (space.inner, space.maps) if isinstance(space, WiderSpace) else (space, ())
     varied = (name for name in CONDITIONS if name in space.conditions or CONDITIONS[name].varied)
-    return WiderSpace(inner, (*maps, *varied))
+    tasks = (name for name, kind in TASKS.items() if kind == space.asks)
+    return WiderSpace(inner, (*maps, *varied, *tasks))
 
 
 def varied_genes(space: TerrainSpace, genes: NDArray[np.float32], seeds: NDArray[np.uint32]) -> NDArray[np.float32]:

@@ -396,7 +396,7 @@ def test_a_condition_appears_wherever_conditions_do(name):
     (text,) = condition_texts(row, [name])
     assert space.parts(genes[0])[part] == text == space.condition_text(genes[0]) != ""
     without = space.without(genes, [part])
-    np.testing.assert_array_equal(space.condition_rows(without), nominal_row()[None])
+    np.testing.assert_array_equal(space.condition_rows(without), [[*nominal_row()[:-1], condition.asks]])
     assert space.parts(without[0])[part] == f"no {name}"
     assert find_effects(genes[0], [part], space).shape(0, 0.3).kind == condition.cause
     assert num_maps(space) == len(condition.genes) == corridor_maps(torch.as_tensor(genes), space).shape[1]
