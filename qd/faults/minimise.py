@@ -2,7 +2,8 @@
 
 A terrain has parts, such as bumps. Robots cross some of its parts alone, 20 episodes each; a subset fails if under half
 of them reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes check
-it. Then its heights are scaled down together as long as it still fails. Minimal terrains are judged like elites.
+it. Pushes come as late as they still make it fail. Then its heights are scaled down together as long as it still fails.
+Minimal terrains are judged like elites.
 """
 
 import math
@@ -45,6 +46,7 @@ from sim.terrains.terrains import Terrains
 
 MAX_PARTS = 10
 """Parts of a terrain whose subsets, 1,024 at most, are all crossed if need be."""
+_MOMENTS = 8  # at equal distances, from which the latest of a push is chosen
 _SCALE_STEPS = 5  # halvings of the interval that holds the least scale which still fails: it is known to 1/32
 _LEAST_EFFECT_M = 1e-4  # a part that changes no height by more is none
 _ROW_EPISODES = 5  # of a row of genes; the episodes of a trial are spread over workers by rows
@@ -60,6 +62,8 @@ class Trial(NamedTuple):
     parts: Parts
     scale: float = 1.0
     """What their heights are multiplied by."""
+    moments: tuple[tuple[int, float], ...] = ()
+    """When some parts come that come at some time [s], if not as in the terrain."""
     fresh: bool = False
     """Whether to cross in 40 episodes, with other seeds than the 20 by which a subset is found."""
 
@@ -83,6 +87,10 @@ class Case:
     """Outcomes of each trial; those of all parts together, the elite's fresh ones, are there from the start."""
     minimal: Parts = ()
     """Parts that it takes to fail, once it was taken apart."""
+    later: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    """When parts come that come at some time, and the latest that they can [s], by part."""
+    moments: tuple[tuple[int, float], ...] = ()
+    """The latest at which parts of the minimal terrain come while it fails, where that is later than they do [s]."""
     scale: float | None = None
     """Least scale of their heights that was crossed and fails; None if they cannot be scaled."""
     passing_scale: float | None = None
@@ -96,7 +104,7 @@ class Case:
     @property
     def fresh(self) -> NDArray[np.int64]:
         """Outcomes of the 40 fresh episodes on the minimal terrain."""
-        return self.counts[Trial(self.minimal, fresh=True)]
+        return self.counts[Trial(self.minimal, moments=self.moments, fresh=True)]
 
     @property
     def without(self) -> dict[int, NDArray[np.int64]]:
@@ -125,12 +133,13 @@ Steps = Generator[list[Trial], None, Any]
 def find_minimal(case: Case) -> Steps:
     """Finds the minimal terrain of a case, and the least scale of its heights by halving."""
     case.minimal = yield from _exhaustive(case) if case.how == "exhaustive" else _greedy(case)
+    case.moments = yield from _find_latest(case)
     if set(case.minimal) <= set(case.flat):
         return
     passing = 0.0
     failing = 1.0
     for _ in range(_SCALE_STEPS):
-        trial = Trial(case.minimal, scale=(passing + failing) / 2)
+        trial = Trial(case.minimal, scale=(passing + failing) / 2, moments=case.moments)
         yield from _missing(case, trial)
         if case.fails(trial):
             failing = trial.scale
@@ -138,6 +147,21 @@ def find_minimal(case: Case) -> Steps:
             passing = trial.scale
     case.scale = failing
     case.passing_scale = passing or None
+
+
+def _find_latest(case: Case) -> Steps:
+    """The latest moments of parts at which the minimal terrain still fails, one part after another."""
+    moments = ()
+    for part, (time_s, latest) in case.later.items():
+        if part in case.minimal:
+            times = [time_s + (latest - time_s) * (k + 1) / _MOMENTS for k in range(_MOMENTS)]
+            trials = [Trial(case.minimal, moments=(*moments, (part, round(time, 3)))) for time in times]
+            yield from _missing(case, *trials)
+            if failing := [trial for trial in trials if case.fails(trial)]:
+                moments = failing[-1].moments
+    fresh = Trial(case.minimal, moments=moments, fresh=True)
+    yield from _missing(case, fresh)
+    return moments if case.fails(fresh) else ()
 
 
 def _rest(parts: Parts, part: int) -> Parts:
@@ -187,7 +211,7 @@ def _greedy(case: Case) -> Steps:
 def cut_genes(genes: NDArray[np.float32], trial: Trial, space: TerrainSpace) -> NDArray[np.float32]:
     """Genes of the parts of a terrain that a trial crosses, shape (num_genes,)."""
     gone = [part for part in range(len(space.parts(genes))) if part not in trial.parts]
-    left = space.without(genes[None], gone)
+    left = space.at_moments(space.without(genes[None], gone), dict(trial.moments))
     scaled = space.scaled(left, trial.scale) if trial.scale != 1.0 else left
     assert scaled is not None
     return scaled[0]
@@ -210,6 +234,7 @@ def open_case(
         parts=tuple(sorted(parts, key=lambda part: (*effects.way(part, half_width), part))),
         how=how or ("exhaustive" if on_gpu and len(parts) <= MAX_PARTS else "greedy"),
         flat=tuple(part for part in parts if not scalable or np.abs(effects.heights[part]).max() <= _LEAST_EFFECT_M),
+        later=space.moments(genes),
         counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
     )
 
@@ -332,7 +357,8 @@ def _as_elites(archive: Archive, cases: Mapping[int, Case], space: TerrainSpace)
     rows = archive.rows(np.array([*cases], np.int64))
     assert rows.fresh is not None
     counts = np.array([case.fresh for case in cases.values()], np.int64).reshape(-1, len(OUTCOMES))
-    genes = [cut_genes(archive.genes[number], Trial(case.minimal), space) for number, case in cases.items()]
+    trials = {number: Trial(case.minimal, moments=case.moments) for number, case in cases.items()}
+    genes = [cut_genes(archive.genes[number], trial, space) for number, trial in trials.items()]
     episodes = {"episodes": counts.sum(axis=1), "invalid_episodes": counts[:, OUTCOMES.index("invalid")]}
     fresh = replace(rows.fresh, goal_rate=goal_rates(counts), **episodes)
     unjudged: dict[str, Any] = no_outcomes(len(rows)) | dict.fromkeys(("certifiers", "certifier_sha256"), ())
@@ -343,8 +369,9 @@ def _as_elites(archive: Archive, cases: Mapping[int, Case], space: TerrainSpace)
 def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[str, Any]:
     """A minimal terrain as ``minimal.json`` has it, without its verdict."""
     space = search.space
-    descriptions = space.parts(archive.genes[number])
-    genes = [cut_genes(archive.genes[number], Trial(case.minimal, scale), space) for scale in (1.0, case.scale or 1.0)]
+    trials = [Trial(case.minimal, scale, case.moments) for scale in (1.0, case.scale or 1.0)]
+    genes = [cut_genes(archive.genes[number], trial, space) for trial in trials]
+    descriptions = space.parts(genes[0])
     effects = find_effects(genes[0], case.minimal, space)
     shapes = {part: effects.shape(index, search.robot.half_width) for index, part in enumerate(case.minimal)}
     cause = case.cause({part: abs(shape.height_m) for part, shape in shapes.items()})

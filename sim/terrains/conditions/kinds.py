@@ -70,6 +70,8 @@ class Condition:
     """Warp function that disturbs a control step."""
     disturbs_last: ClassVar[bool] = False
     """Whether it disturbs what others have disturbed."""
+    moment: str | None = None
+    """Its gene that says when it comes [s], if one does."""
     asks: ClassVar[Kind] = Kind.CROSS
     """What the robots of a space with it are asked for."""
 
@@ -363,6 +365,7 @@ class Push(Condition):
         Gene(name="push_y", low=-2.0, middle=0.0, high=2.0, unit="m/s", mirrored=True),
         Gene(name="push_time", low=0.0, middle=6.0, high=12.0, unit="s", hard_at_limits=False),
     )
+    moment = "push_time"
     dose = Sweep("push_y", (0.0, 0.5, 1.0, 1.5, 2.0), {"push_time": 5.0}, "push to the side")
     disturb = _disturb_push
 

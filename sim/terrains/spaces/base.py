@@ -1,6 +1,6 @@
 """What every terrain space has."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -79,6 +79,14 @@ class TerrainSpace:
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
         """Genes of the same terrains with all heights times ``scale``, which is in (0, 1]; None where none can be."""
         return None
+
+    def moments(self, genes: ArrayLike) -> dict[int, tuple[float, float]]:
+        """When parts come, and the latest that they can [s], of one row of genes (num_genes,), by part. Few do."""
+        return {}
+
+    def at_moments(self, genes: ArrayLike, moments: Mapping[int, float]) -> NDArray[np.float32]:
+        """Genes (num_terrains, num_genes) of the same terrains, where parts come at other moments [s]."""
+        return self.validate(genes)
 
     def describe(self, genes: ArrayLike) -> str:
         """A terrain as text, one part a line, of one row of genes (num_genes,)."""

@@ -114,6 +114,31 @@ class WiderSpace(TerrainSpace):
                     changed[:, self._columns[part - count]] = self._absent[part - count]
         return changed
 
+    def moments(self, genes: ArrayLike) -> dict[int, tuple[float, float]]:
+        """When conditions come that come at some time, and the latest that they can [s]; absent ones do not."""
+        row = clipped(genes)
+        texts = self._condition_texts(row)
+        first = len(self.parts(row)) - len(texts)
+        values = self.condition_rows(row[None])[0]
+        return {
+            first + k: (float(values[condition_column(gene.name)]), gene.high)
+            for k, name in enumerate(self.conditions)
+            for gene in CONDITIONS[name].genes
+            if gene.name == CONDITIONS[name].moment and texts[k]
+        }
+
+    def at_moments(self, genes: ArrayLike, moments: Mapping[int, float]) -> NDArray[np.float32]:
+        """Genes whose conditions of these parts come at other moments [s]."""
+        changed = self.validate(genes).copy()
+        first = len(self.parts(changed[0])) - len(self.conditions)
+        for part, time_s in moments.items():
+            condition = CONDITIONS[self.conditions[part - first]]
+            names = [gene.name for gene in condition.genes]
+            column = names.index(str(condition.moment))
+            columns = self._columns[NUM_PATCHES * len(self.maps) + part - first]
+            changed[:, columns.start + column] = condition.genes[column].to_gene(time_s)
+        return changed
+
     def scaled(self, genes: ArrayLike, scale: float) -> NDArray[np.float32] | None:
         """Genes with heights scaled by the inner space; the others stay as they are."""
         rows, first = clipped(self.validate(genes)), self.inner.num_genes

@@ -9,7 +9,7 @@ import pytest
 
 from qd.faults.causes import find_effects
 from qd.faults.judge import Judging
-from qd.faults.minimise import Case, Trial, find_minimal, minimise, open_case, take_apart
+from qd.faults.minimise import Case, Trial, cut_genes, find_minimal, minimise, open_case, take_apart
 from qd.faults.numbers import read_minimal
 from qd.faults.searches import Search
 from qd.search.archive import read_archive
@@ -199,6 +199,27 @@ def test_conditions_are_parts_that_are_kept_where_the_robot_fails_by_them_alone(
     assert effects.conditions == ("",) * 8 + ("payload", "", "push")
     assert [effects.shape(part, 0.3).kind for part in (8, 10)] == ["payload", "push"]
     assert effects.shape(3, 0.3).height_m > 0.1
+
+
+def test_a_push_comes_as_late_as_it_still_makes_the_robot_fail():
+    space, archive = get_space("super_gaussian+payload+push"), small_archive(1)
+    genes = space.without(np.zeros((1, space.num_genes), np.float32), range(8 + 2))
+    genes[0, [67, 68, 69]] = 0.4, 0.4, -0.5  # a push after 3 s
+    assert space.moments(genes[0]) == {9: (3.0, 12.0)} and space.moments(0.0 * genes[0]) == {}
+    fresh = replace(fresh_values(archive), goal_rate=np.full(1, 0.1))
+    archive = replace(archive, fresh=fresh, genes=genes, space=space)
+
+    def pushed_by(latest):
+        return lambda cfg, genes, seeds: (
+            (genes[:, 67] > 0.3) & (space.condition_rows(genes)[:, condition_column("push_time")] < latest)
+        )
+
+    for latest, moments in ((7.6, ((9, 7.5),)), (4.0, ()), (99.0, ((9, 12.0),))):
+        case = open_case(archive, 0, space, 0.3, "greedy", on_gpu=False)
+        take_all_apart(archive, {0: case}, Robots(pushed_by(latest)), space)
+        assert case.minimal == (9,) and case.moments == moments
+        row = space.condition_rows(cut_genes(genes[0], Trial((9,), moments=moments), space)[None])[0]
+        assert row[condition_column("push_time")] == pytest.approx(moments[0][1] if moments else 3.0)
 
 
 @pytest.fixture(autouse=True)
