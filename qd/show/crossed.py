@@ -1,5 +1,6 @@
 """Recorded crossings in numbers and figures: how they ended, and where."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -120,6 +121,27 @@ def find_ghost_episode(recording: Recording, episode: int, scales: dict[str, flo
     """The episode of another controller to show beside one: the same start, or if only others arrive a typical one."""
     arrived = recording.outcome[0] == Outcome.GOAL
     return episode if arrived[episode] or not arrived.any() else find_typical_episode(recording, scales, Outcome.GOAL)
+
+
+def draw_time_line(acting: Sequence[tuple[str, float, float]], recording: Recording) -> Figure:
+    """What acts on the robots of one terrain, from when to when [s], and when their episodes went wrong."""
+    outcome = recording.outcome[0]
+    failed = np.flatnonzero((outcome != Outcome.GOAL) & (outcome != Outcome.INVALID))
+    figure = new_figure(8.0, 0.8 + 0.3 * len(acting))
+    axes = figure.subplots()
+    for row, (text, first, last) in enumerate(acting):
+        if first == last:
+            axes.plot([first], [row], "v", color="#d55e00")
+        else:
+            axes.barh(row, last - first, left=first, height=0.6, color="#56b4e9", alpha=0.6)
+        axes.text(first, row, f" {text}", va="center", fontsize="small")
+    for episode in failed:
+        axes.axvline(find_failure_time(recording, int(episode)), color="#000000", alpha=0.3, linewidth=1.0)
+    axes.set(
+        xlabel="time [s]; a line where a robot fails", yticks=[], xlim=(0.0, max(last for *_, last in acting) + 0.5)
+    )
+    axes.set_ylim(len(acting) - 0.5, -0.5)
+    return figure
 
 
 def make_title(recording: Recording, controller: str = "") -> str:

@@ -13,7 +13,7 @@ from qd.faults.families import VERDICTS, Ranking, summarise_search
 from qd.faults.numbers import MinimalTerrains, describe_witness, fault_numbers, further_rates
 from qd.search.directory import METRICS_FILE, ROUNDS_FILE, RunDirectory, output_folder
 from qd.search.progress import Bar
-from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing
+from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing, draw_time_line
 from qd.show.elites import OpenedRun, open_run
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.recordings import Recordings, request_elite
@@ -150,6 +150,8 @@ def _make_case(
     rates = {"for this page": rate, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
     rates |= {label: Rate(*counts) for label, counts in further_rates(opened_run.archive, number).items()}
     rows = [[label, f"{rate.hits} of {rate.count}", rate.limits] for label, rate in rates.items()]
+    acting = opened_run.space.time_line(opened_run.archive.genes[number], opened_run.robot.max_duration_s)
+    in_time = any((first, last) != (0.0, opened_run.robot.max_duration_s) for _, first, last in acting)
     return {
         "number": number,
         "name": ranking.name(row),
@@ -159,6 +161,7 @@ def _make_case(
         "conditions": opened_run.space.condition_text(opened_run.archive.genes[number]),
         "beside": beside,
         "witness": describe_witness(opened_run.archive, number),
+        "time_line": page.encode_picture(draw_time_line(acting, recording)) if in_time else "",
         "figure": "",
         "rate": rate,
         "rates": page.Table(head=["goal reached", "", "95 % interval"], rows=rows),

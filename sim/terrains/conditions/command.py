@@ -31,6 +31,10 @@ class Segment(Condition):
             self.dose = Sweep(f"{self.name}_turn", (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), title=title)
         self._number = number
 
+    def span(self, values: Array, duration_s: float) -> tuple[float, float]:
+        """Its share of the time."""
+        return duration_s * (self._number - 1) / SEGMENTS, duration_s * self._number / SEGMENTS
+
     def text(self, values: Array) -> str:
         """The command, over the robot's speed; empty of straight on."""
         x, y, turn = map(float, values)

@@ -80,6 +80,13 @@ class Condition:
         nominal = self.genes[0].to_value(self.genes[0].absent)
         return self.form.format(*values) if abs(values[0] - nominal) >= self.least else ""
 
+    def span(self, values: Array, duration_s: float) -> tuple[float, float]:
+        """When it acts in an episode of this length [s]; a moment begins and ends at once."""
+        if self.moment is None:
+            return 0.0, duration_s
+        time_s = float(values[[gene.name for gene in self.genes].index(self.moment)])
+        return time_s, time_s
+
     def to_genes(self, values: Mapping[str, Any]) -> NDArray[np.float64]:
         """Genes of some values by name, each of shape (...), as (..., number of genes); the others change nothing."""
         genes = (gene.to_gene(values[gene.name]) if gene.name in values else gene.absent for gene in self.genes)

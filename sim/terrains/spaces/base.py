@@ -88,6 +88,10 @@ class TerrainSpace:
         """Genes (num_terrains, num_genes) of the same terrains, where parts come at other moments [s]."""
         return self.validate(genes)
 
+    def time_line(self, genes: ArrayLike, duration_s: float) -> list[tuple[str, float, float]]:
+        """What acts on a robot, from when to when [s] in an episode of this length, of one row of genes (num_genes,)."""
+        return []
+
     def describe(self, genes: ArrayLike) -> str:
         """A terrain as text, one part a line, of one row of genes (num_genes,)."""
         return "\n".join(self.parts(genes))

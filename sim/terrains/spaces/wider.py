@@ -9,7 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from kernels.episode import Kind
 from kernels.ground import COLS, NUM_PATCHES, PATCH, ROWS, Ground, decode_friction, decode_softness
-from sim.terrains.conditions.kinds import CONDITIONS, TASKS, condition_column, condition_genes, condition_texts
+from sim.terrains.conditions.kinds import (
+    CONDITIONS,
+    TASKS,
+    condition_column,
+    condition_genes,
+    condition_texts,
+    split_row,
+)
 from sim.terrains.spaces.base import Seed, TerrainSpace, clipped
 from sim.terrains.terrains import GROUND_KINDS, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, patch_index
 
@@ -126,6 +133,12 @@ class WiderSpace(TerrainSpace):
             for gene in CONDITIONS[name].genes
             if gene.name == CONDITIONS[name].moment and texts[k]
         }
+
+    def time_line(self, genes: ArrayLike, duration_s: float) -> list[tuple[str, float, float]]:
+        """The conditions that are not nominal."""
+        row = self.condition_rows(np.asarray(genes)[None])[0]
+        acting = [(c, values) for c, values in split_row(row) if c.name in self.conditions and c.text(values)]
+        return [(condition.text(values), *condition.span(values, duration_s)) for condition, values in acting]
 
     def at_moments(self, genes: ArrayLike, moments: Mapping[int, float]) -> NDArray[np.float32]:
         """Genes whose conditions of these parts come at other moments [s]."""
