@@ -89,7 +89,7 @@ class TerrainSpace:
         return self.validate(genes)
 
     def time_line(self, genes: ArrayLike, duration_s: float) -> list[tuple[str, float, float]]:
-        """What acts on a robot, from when to when [s] in an episode of this length, of one row of genes (num_genes,)."""
+        """What acts on a robot in an episode of this length, from when to when [s], of genes (num_genes,)."""
         return []
 
     def describe(self, genes: ArrayLike) -> str:
