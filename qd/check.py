@@ -45,7 +45,7 @@ _ENOUGH = 200  # failing episodes that scales are means over; if there are fewer
 _MAX_ROUNDS = 5  # how often as many terrains as at first are crossed
 _HEIGHTS = (0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, MAX_HEIGHT)  # to choose from [m]
 _CROSSED = 0.8  # share of episodes that should reach the goal
-_ROUTES = 100  # on level ground
+_ROUTES, _STRAY_SHARE = 100, 0.99  # on level ground, and the share of their displacements that is no straying
 _TRIED = 100  # hard-random terrains at a height, one episode each: terrains differ more than their episodes
 
 
@@ -142,7 +142,7 @@ def measure_stray(robot: RobotCfg, policy: str, device: str) -> float:
 
     rollout.watch = watch
     rollout.evaluate(terrains)
-    return float(np.quantile(np.concatenate(errors), 0.99))
+    return float(np.quantile(np.concatenate(errors), _STRAY_SHARE))
 
 
 def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:
