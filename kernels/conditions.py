@@ -1,10 +1,11 @@
-"""Conditions under which robots cross: they vary a robot where its episode begins, and disturb its control steps.
+"""Conditions under which robots cross: they vary a robot where its episode begins, and disturb its steps.
 
 A terrain has a row of numbers, the values of all conditions (:mod:`sim.terrains.conditions`). A condition is one or two
 Warp functions, which read their numbers from column ``first`` on:
 
     begin(robot: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int)
     disturb(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int)
+    force(step: ForcedStep, row: wp.array[float], first: int, env: int)
 """
 
 from collections.abc import Callable
@@ -20,6 +21,8 @@ Effects = tuple[tuple[Any, int], ...]
 """Warp functions of conditions, each with the column of its first number."""
 BASE = wp.constant(1)
 """The solver's number of the base."""
+LINKS = wp.constant(6)
+"""Largest number of a link (:func:`sim.robots.compiled.number_links`)."""
 
 
 @wp.struct
@@ -62,6 +65,8 @@ class Disturbed:
     """Observations of the last control steps, shape (num_envs, 1 + max_lag_steps, observation_size)."""
     age: wp.array2d[int]
     """Observations since the episode began, shape (num_envs, observation_size): each column counts for itself."""
+    steps: wp.array[int]
+    """Physics steps since the episode began, shape (num_envs,)."""
 
 
 @wp.struct
@@ -76,6 +81,39 @@ class DisturbedStep:
     """How many of them are a control step."""
     joint_qd: wp.array2d[float]
     observation: wp.array2d[float]
+
+
+@wp.struct
+class ForcedStep:
+    """A physics step whose forces are found, to add some to: arrays of the solver under its names, a row a world."""
+
+    memory: Disturbed
+    dt: float
+    """Length of a physics step [s]."""
+    links: wp.array[int]
+    """Bodies by their numbers (:func:`sim.robots.compiled.number_links`), shape (2 * LINKS + 1,)."""
+    body_rootid: wp.array[int]
+    body_isdofancestor: wp.array2d[int]
+    """Whether a body moves with a dof, shape (num_bodies, num_dofs)."""
+    body_subtreemass: wp.array2d[float]
+    body_ipos: wp.array2d[wp.vec3]
+    xpos: wp.array2d[wp.vec3]
+    xquat: wp.array2d[wp.quat]
+    subtree_com: wp.array2d[wp.vec3]
+    cdof: wp.array2d[wp.spatial_vector]
+    qfrc_smooth: wp.array2d[float]
+
+
+@wp.func
+def push_body(step: ForcedStep, env: int, body: int, force: wp.vec3):
+    """Add a force [N], world frame, at the mass centre of a body."""
+    wxyz = step.xquat[env, body]
+    turn = wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0])
+    centre = step.xpos[env, body] + wp.quat_rotate(turn, step.body_ipos[env, body])
+    moment = wp.cross(centre - step.subtree_com[env, step.body_rootid[body]], force)
+    for n in range(step.qfrc_smooth.shape[1]):
+        if step.body_isdofancestor[body, n] != 0:
+            step.qfrc_smooth[env, n] += wp.dot(step.cdof[env, n], wp.spatial_vector(moment, force))
 
 
 @cache
@@ -104,6 +142,7 @@ def make_begin(effects: Effects) -> Callable[..., None]:
             disturbed_out.row[env, k] = conditions[t, k]
         for k in range(disturbed_out.age.shape[1]):
             disturbed_out.age[env, k] = 0
+        disturbed_out.steps[env] = 0
         for k in range(count):
             wp.static(functions[k])(robots_out, conditions[t], wp.static(firsts[k]), t, env)
 
@@ -124,3 +163,19 @@ def make_disturb(effects: Effects) -> Callable[..., None]:
         step.memory.age[env, column] += 1
 
     return disturb
+
+
+@cache
+def make_force(effects: Effects) -> Callable[..., None]:
+    """What adds forces to those that the dynamics have found, before constraints are solved."""
+    functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
+
+    @kernel_over("step.memory.steps", module="unique")
+    def force(step: ForcedStep):
+        """Grid (num_envs,)."""
+        env = wp.tid()
+        for k in range(count):
+            wp.static(functions[k])(step, step.memory.row[env], wp.static(firsts[k]), env)
+        step.memory.steps[env] += 1
+
+    return force

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from kernels.actuator_net import make_torques
-from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb
+from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_force
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
 from kernels.episode import Episodes, Outcome
@@ -25,7 +25,7 @@ from kernels.state import RobotStep
 from sim.crossing import GROUND_FRICTION, SolverCfg
 from sim.device import recording
 from sim.robots.actuator_net import ActuatorNet
-from sim.robots.compiled import robot_spec
+from sim.robots.compiled import number_links, robot_spec
 from sim.robots.model import make_builder
 from sim.robots.probes import make_probes
 from sim.robots.robot import ActuatorNetCfg, RobotCfg
@@ -250,8 +250,10 @@ class Simulation:
         observed = (self.num_envs, robot.observation_size)
         rows = (self.num_envs, self.bank.conditions.shape[1])
         former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)
-        self.disturbed = make_zeros(Disturbed, self.device, row=rows, age=observed, former=former)
+        self.disturbed = make_zeros(Disturbed, self.device, row=rows, age=observed, former=former, steps=self.num_envs)
         self.disturbed.noise = self.make_noise(NoiseCfg())
+        links = wp.array(number_links(robot), dtype=int)
+        self._forced = self.dynamics.view_forces(memory=self.disturbed, dt=robot.physics_dt, links=links)
 
     def set_drive_delays(self, steps: np.ndarray) -> None:
         """Let targets of each robot be late by so many physics steps, at most the robot's ``drive_delay_steps``."""
@@ -309,8 +311,8 @@ class Simulation:
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
 
-        It leaves out what these robots do not need: forces from outside (``body_f``, ``joint_f``), targets of
-        velocities, and poses of bodies after the step, which the next one finds again.
+        It leaves out what these robots do not need: forces from outside (``body_f``, ``joint_f``) but those of
+        conditions, targets of velocities, and poses of bodies after the step, which the next one finds again.
         """
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
@@ -320,6 +322,8 @@ class Simulation:
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self.dynamics.find()
+            if self.disturbed is not None:
+                make_force(condition_effects("force"))(self._forced)
             poses_from_solver(coordinates, self.body_q)
             self.collide()
             self.dynamics.step()

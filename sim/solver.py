@@ -13,7 +13,7 @@ from mujoco_warp._src import types
 from numpy.typing import NDArray
 
 from kernels import dynamics, solver
-from kernels.conditions import BASE, VariedRobots
+from kernels.conditions import BASE, ForcedStep, VariedRobots
 from kernels.contact import Contacts, Surfaces
 from kernels.coordinates import SolverContacts, contacts_to_solver, forces_from_solver
 from kernels.dynamics import Robots, Tree, TreeSizes, find_dynamics
@@ -134,8 +134,9 @@ def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
 class Dynamics:
     """The dynamics of a physics step in two kernels, one before and one after contacts are found.
 
-    External forces (``qfrc_applied``, ``xfrc_applied``) are ignored. Numbers of the model may change if they do so in
-    all worlds equally, or differed between worlds at the start; its arrays may not be replaced.
+    External forces (``qfrc_applied``, ``xfrc_applied``) are ignored; :meth:`view_forces` is where some can be added.
+    Numbers of the model may change if they do so in all worlds equally, or differed between worlds at the start; its
+    arrays may not be replaced.
 
     Attributes:
         surfaces: Contact parameters of a robot's shapes on the ground.
@@ -183,6 +184,10 @@ class Dynamics:
                 setattr(self.tree, name, wp.array(rows, dtype=array.dtype))
                 values[base_name] = wp.array(rows[:, BASE], dtype=array.dtype)
         return make_struct(VariedRobots, self.tree, self._robots, **values)
+
+    def view_forces(self, **values: Any) -> ForcedStep:
+        """The forces that :meth:`find` found; ``values`` are further ones of :class:`ForcedStep`."""
+        return make_struct(ForcedStep, self.tree, self._robots, self._problem, **values)
 
     def find(self) -> None:
         """Compute poses, inertias and all forces but those of constraints, from ``qpos``, ``qvel`` and ``ctrl``."""

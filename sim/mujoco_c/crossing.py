@@ -84,6 +84,7 @@ class EpisodeStates:
         self.strength = 1.0
         self.delay_steps = robot.drive_delay_steps
         self.former_rows = deque[Array]()
+        self._steps = 0
         self.rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))
         self._conditions = split_row(nominal_row() if conditions is None else conditions)
         for condition, values in self._conditions:
@@ -112,6 +113,11 @@ class EpisodeStates:
         controls = self._delayed.popleft()[:, self._joints]
         if self._net is not None:
             controls = self._net.step(controls - self.qpos[:, 7 + self._joints], self.qvel[:, 6 + self._joints])
+        for k in running:
+            self.data[k].xfrc_applied[:] = 0.0
+        for condition, values in self._conditions:
+            condition.force_plain(self, values, running, self._steps)
+        self._steps += 1
         for k in running:
             data = self.data[k]
             data.ctrl[:] = controls[k]

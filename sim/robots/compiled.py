@@ -10,6 +10,7 @@ import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from kernels.conditions import LINKS
 from sim.files.command import with_traceback
 from sim.robots.model_files import ModelFiles, read_model_files
 from sim.robots.robot import RobotCfg
@@ -27,6 +29,7 @@ _JOINT = mj.mjtTrn.mjTRN_JOINT
 _GAINS = ("stiffness", "damping", "effort_limit", "armature")
 PER_JOINT = ("default_joint_pos", *_GAINS, "saturation_effort", "velocity_limit")
 """Settings with a value for each joint."""
+_MIDDLE = 0.01  # links whose mass centres are nearer to the base's middle lie on both sides [m]
 _SLACK = 1e-3  # files round [rad]
 _URDF_FRICTION = 1.0
 _URDF_TIME_CONSTANT_S = 0.01
@@ -54,6 +57,25 @@ _NEWTON_SOLVERS = {
 def joint_names(model: Any) -> tuple[str, ...]:
     """Names of a compiled robot's joints without that of its base."""
     return tuple(model.joint(k).name for k in range(1, model.njnt))
+
+
+@lru_cache(maxsize=8)
+def number_links(robot: RobotCfg) -> NDArray[np.int32]:
+    """Bodies by their numbers from ``-LINKS`` to ``LINKS``, shape (2 * LINKS + 1,).
+
+    The base is 0, links on its left have positive numbers, those on its right negative ones, and those in its middle
+    both. They are counted leg after leg, each from the base on, in the model's order. More or fewer than ``LINKS`` on a
+    side have numbers that are spread over them.
+    """
+    model = robot_spec(robot).compile()
+    data = mj.MjData(model)
+    data.qpos[3:7] = 1.0, 0.0, 0.0, 0.0
+    mj.mj_kinematics(model, data)
+    to_left = data.xipos[2:, 1] - data.xpos[1, 1]
+    sides = [2 + np.flatnonzero(side * to_left > -_MIDDLE) for side in (-1.0, 1.0)]
+    sides = [links if len(links) else np.array([1]) for links in sides]
+    right, left = (links[-(-np.arange(1, LINKS + 1) * len(links) // LINKS) - 1] for links in sides)
+    return np.array([*right[::-1], 1, *left], np.int32)
 
 
 def touching_geoms(*bodies: Any) -> list[Any]:

@@ -68,6 +68,8 @@ class Condition:
     """Warp function that varies a robot where its episode begins (:mod:`kernels.conditions`)."""
     disturb: ClassVar[Any] = None
     """Warp function that disturbs a control step."""
+    force: ClassVar[Any] = None
+    """Warp function that adds forces in a physics step."""
     disturbs_last: ClassVar[bool] = False
     """Whether it disturbs what others have disturbed."""
     moment: str | None = None
@@ -101,6 +103,9 @@ class Condition:
         ``step`` counts physics steps since the episodes began.
         """
         return rows
+
+    def force_plain(self, episodes: Any, values: Array, running: Any, step: int) -> None:
+        """Adds to ``xfrc_applied`` of the episodes ``running`` before a physics step; it was 0."""
 
 
 CONDITIONS: dict[str, Condition] = {}
@@ -142,7 +147,7 @@ def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str
     return [texts[name] for name in names]
 
 
-def condition_effects(stage: Literal["begin", "disturb"]) -> tuple[tuple[Any, int], ...]:
+def condition_effects(stage: Literal["begin", "disturb", "force"]) -> tuple[tuple[Any, int], ...]:
     """Warp functions of a stage in the order in which they act, each with its first column in a row."""
     columns = sorted(split_row(np.arange(len(nominal_row()))), key=lambda pair: pair[0].disturbs_last)
     return tuple((effect, int(own[0])) for condition, own in columns if (effect := getattr(condition, stage)))
@@ -157,6 +162,13 @@ def _direction_text(values: Array, form: str, least: float, directions: Sequence
     """Two numbers along the axes, each with one of four ``directions``: ahead, back, left, right."""
     large = [(axis, value) for axis, value in enumerate(values) if abs(value) >= least]
     return " and ".join(f"{abs(value):{form}} {directions[2 * axis + (value < 0)]}" for axis, value in large)
+
+
+def push_text(values: Array) -> str:
+    """The first two numbers of a push [m/s] as text; empty where there is none to speak of."""
+    directions = ("m/s ahead", "m/s back", "m/s to the left", "m/s to the right")
+    pushed = _direction_text(values[:2], ".1f", 0.05, directions)
+    return pushed and f"pushed by {pushed}"
 
 
 @wp.func
@@ -378,10 +390,8 @@ class Push(Condition):
 
     def text(self, values: Array) -> str:
         """Its velocity and its time."""
-        if np.abs(values[:2]).max() < 0.05:
-            return ""
-        directions = ("m/s ahead", "m/s back", "m/s to the left", "m/s to the right")
-        return f"pushed by {_direction_text(values[:2], '.1f', 0.05, directions)} after {values[2]:.0f} s"
+        pushed = push_text(values)
+        return pushed and f"{pushed} after {values[2]:.0f} s"
 
     def disturb_plain(self, episodes: Any, values: Array, rows: Array, running: Any, step: int) -> Array:
         """Adds to the velocities of the bases of the running episodes."""

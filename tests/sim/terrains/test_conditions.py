@@ -46,6 +46,7 @@ CASES = {
     "lag": {"lag": 0.02},
     "push": {"push_x": -0.4, "push_y": 0.6, "push_time": 0.1},
     "grip": {"friction": 0.5},
+    "push_1": {"push_1_x": -0.4, "push_1_y": 0.6, "push_1_time": 0.1, "push_1_link": 2},
 }
 
 

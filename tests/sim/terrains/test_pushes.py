@@ -1,0 +1,145 @@
+"""Pushes on links, against plain MuJoCo C, against momentum, and as conditions of a terrain."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from sim.mujoco_c.crossing import EpisodeStates
+from sim.mujoco_c.model import Starts, crossing_model
+from sim.robots.compiled import mj, number_links, robot_spec
+from sim.robots.find import get_robot
+from sim.simulation import Simulation
+from sim.terrains.bank import TerrainBank
+from sim.terrains.conditions.kinds import CONDITIONS, GROUPS, condition_column, nominal_row
+from sim.terrains.spaces.registry import load_space
+from sim.terrains.terrains import GroundMaps
+from tests.sim.dogs import write_dog
+from tests.sim.scenes import FLAT, free_body, positions, put, velocities
+
+SPACE = load_space("super_gaussian+pushes")
+LINKS = 6
+SIZE, BEGIN, STEPS = (0.12, -0.16), 2, 20
+"""Of the pushes here [m/s]; the physics step in which they begin, and how many they last."""
+
+
+def rows_of(*pushes: dict[str, float]) -> np.ndarray:
+    """Rows of conditions with some values, the others nominal."""
+    rows = np.tile(nominal_row(), (len(pushes), 1))
+    for row, push in zip(rows, pushes, strict=True):
+        for name, value in push.items():
+            row[condition_column(name)] = value
+    return rows
+
+
+def push(link: int, number: int = 1, size=SIZE, seconds: float = BEGIN * 0.005) -> dict[str, float]:
+    values = dict(zip("xy", size, strict=True)) | {"time": seconds, "link": link}
+    return {f"push_{number}_{name}": value for name, value in values.items()}
+
+
+def fall(robot, rows, steps, device="cpu", seed=0):
+    """Falls from one random state high above ground, with each row of conditions, ours and in MuJoCo C.
+
+    Yields for each number of ``steps`` joint coordinates and velocities, both as MuJoCo has them.
+    """
+    rng = np.random.default_rng(seed)
+    joints = np.array(robot.default_joint_pos) + rng.uniform(-0.1, 0.1, robot.num_joints)
+    quaternion = rng.normal(size=4)
+    joint_q = np.concatenate([[4.0, 4.0, 20.0], quaternion / np.linalg.norm(quaternion), joints])
+    joint_qd = rng.uniform(-1.0, 1.0, 6 + robot.num_joints)
+    joint_q, joint_qd = (np.tile(values, (len(rows), 1)).astype(np.float32) for values in (joint_q, joint_qd))
+    bank = TerrainBank(len(rows), device=device, with_conditions=True)
+    grounds = dataclasses.replace(GroundMaps.plain(len(rows)), conditions=rows)
+    bank.set_heights(np.tile(FLAT, (len(rows), 1, 1)), ground=grounds)
+    sim = Simulation(robot, bank, np.arange(len(rows)))
+    put(sim, joint_q, joint_qd)
+    with wp.ScopedDevice(device):
+        sim.begin_conditions(wp.ones(len(rows), dtype=int))
+    com = robot_spec(robot).compile().body_ipos[1]
+    starts = Starts.of_newton(joint_q, joint_qd, com)
+    plain = [EpisodeStates(robot, crossing_model(robot, FLAT), starts[:1], row.astype(float)) for row in rows]
+    for episodes in plain:
+        episodes.targets[:] = joint_q[:1, 7:]
+    made = 0
+    for until in steps:
+        for _ in range(until - made):
+            sim.physics_step()
+            for episodes in plain:
+                episodes.step(np.arange(1))
+        made = until
+        ours = Starts.of_newton(positions(sim), velocities(sim), com)
+        qpos, qvel = (np.concatenate([getattr(episodes, name) for episodes in plain]) for name in ("qpos", "qvel"))
+        yield ours, Starts(qpos=qpos, qvel=qvel)
+
+
+def mean_velocity(robot, states: Starts) -> np.ndarray:
+    """Of the whole robot's mass centre [m/s], shape (num, 3)."""
+    model = robot_spec(robot).compile()
+    data = mj.MjData(model)
+    found = []
+    for data.qpos[:], data.qvel[:] in zip(states.qpos, states.qvel, strict=True):
+        mj.mj_forward(model, data)
+        mj.mj_subtreeVel(model, data)
+        found.append(data.subtree_linvel[1].copy())
+    return np.array(found)
+
+
+def test_a_push_on_each_link_is_that_of_mujoco_c(robot, device):
+    links = range(-LINKS, LINKS + 1)
+    loaded = {"payload": 0.2, "payload_x": 0.1, "payload_y": -0.1}
+    rows = rows_of({}, loaded, *(push(link) for link in links), loaded | push(0), push(2) | push(-3, number=3))
+    (before, _), (after, theirs) = fall(robot, rows, (BEGIN, BEGIN + STEPS), device)
+    without = np.array([0] * len(links) + [1, 0])
+    np.testing.assert_array_equal(before.qvel[2:], before.qvel[without])  # not before its time
+    ours, plain = (states.qvel[2:] - states.qvel[without] for states in (after, theirs))
+    sizes = np.linalg.norm(plain, axis=1)
+    assert (np.linalg.norm(ours - plain, axis=1) < 1e-3 * sizes).all()
+    apart = np.linalg.norm(plain[:, None] - plain, axis=2) + np.diag(sizes)
+    assert apart.min() > 0.02  # each link is another one
+
+
+def test_a_push_gives_its_impulse_in_a_tenth_of_a_second_whatever_the_step(robot):
+    fine = dataclasses.replace(robot, physics_dt=0.001, decimation=20)
+    rows = rows_of({}, push(0), push(-LINKS), push(3, number=2, seconds=0.02))
+    begins, lasts, states = np.array([10, 10, 20]), 100, fall(fine, rows, (10, 30, 60, 130))
+    for made, (ours, plain) in zip((10, 30, 60, 130), states, strict=True):
+        share = np.clip((made - begins) / lasts, 0.0, 1.0)
+        for moved in (mean_velocity(fine, ours), mean_velocity(fine, plain)):
+            expected = share[:, None] * [*SIZE, 0.0]
+            np.testing.assert_allclose(moved[1:] - moved[0], expected, atol=5e-3 * np.hypot(*SIZE))
+
+
+def test_links_are_numbered_from_the_base_on_by_their_side(anymal, tmp_path):
+    model = robot_spec(anymal).compile()
+    names = [model.body(body).name for body in number_links(anymal)]
+    left = [f"L{leg}_{part}" for leg in "FH" for part in ("HIP", "THIGH", "SHANK")]
+    assert names[LINKS:] == ["base", *left]
+    assert names[:LINKS] == [name.replace("L", "R", 1) for name in reversed(left)]
+    dog = get_robot(str(write_dog(tmp_path)))  # four links a side: two thighs and two shanks
+    assert number_links(dog).tolist() == [9, 9, 8, 5, 5, 4, 1, 2, 3, 3, 6, 7, 7]
+    assert number_links(free_body(tmp_path / "ball", 'type="sphere" size="0.1"', mass=1.0)).tolist() == [1] * 13
+
+
+def test_pushes_are_three_parts_of_a_terrain():
+    assert SPACE.conditions == GROUPS["pushes"]
+    assert SPACE.name == "super_gaussian+push_1+push_2+push_3"
+    genes = np.zeros((1, SPACE.num_genes), np.float32)
+    assert SPACE.condition_text(genes[0]) == "nominal conditions"
+    values = {"push_1_x": 1.2, "push_1_y": 0.4, "push_1_time": 5.2, "push_1_link": -5}, {"push_2_y": -0.6}
+    pushed = [CONDITIONS[f"push_{k}"].to_genes(some) for k, some in enumerate(values, 1)]
+    genes[0, 64:72] = np.concatenate(pushed)
+    texts = (
+        "pushed by 1.2 m/s ahead and 0.4 m/s to the left at link 5 of 6 on the right after 5.2 s",
+        "pushed by 0.6 m/s to the right at the base after 6.0 s",
+    )
+    assert SPACE.parts(genes[0])[-3:] == (*texts, "no push_3")
+    assert SPACE.condition_text(SPACE.without(genes, [8])[0]) == texts[1]
+    signs = np.array([-1.0 if gene.mirrored else 1.0 for gene in CONDITIONS["push_1"].genes])
+    mirrored = CONDITIONS["push_1"].text(signs * [*values[0].values()])
+    assert mirrored == "pushed by 1.2 m/s ahead and 0.4 m/s to the right at link 5 of 6 on the left after 5.2 s"
+
+
+def test_only_links_that_there_are_can_be_pushed():
+    with pytest.raises(ValueError, match="push_2_link"):
+        dataclasses.replace(GroundMaps.plain(1), conditions=rows_of(push(7, number=2)))
