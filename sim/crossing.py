@@ -16,7 +16,7 @@ CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 """mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 FALLEN_TILT_DEG = 60.0
 """A robot that leans further than this has fallen [degrees]."""
-PUSHES = ("push_x",)
+PUSHES = ("push_x", "push_1_x", "push_2_x", "push_3_x")
 """First numbers of the conditions that push robots."""
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""

@@ -33,18 +33,24 @@ class LinkPush(Condition):
     force = _force_push
 
     def __init__(self, number: int) -> None:
-        self.name = f"push_{number}"
+        """The push of a number, from 1."""
+        self.name, self.moment = f"push_{number}", f"push_{number}_time"
         speed: dict[str, Any] = {"low": -2.0, "middle": 0.0, "high": 2.0, "unit": "m/s"}
         link: dict[str, Any] = {"low": -LINKS, "middle": 0, "high": LINKS, "step": 1, "limits": (-LINKS, LINKS)}
         self.genes = (
             Gene(name=f"{self.name}_x", **speed),
             Gene(name=f"{self.name}_y", mirrored=True, **speed),
-            Gene(name=f"{self.name}_time", low=0.0, middle=6.0, high=12.0, unit="s", hard_at_limits=False),
+            Gene(name=self.moment, low=0.0, middle=6.0, high=12.0, unit="s", hard_at_limits=False),
             Gene(name=f"{self.name}_link", mirrored=True, hard_at_limits=False, **link),
         )
         if number == 1:
-            others = {f"{self.name}_time": 5.0}
-            self.dose = Sweep(f"{self.name}_y", (0.0, 0.5, 1.0, 1.5, 2.0), others, "push on the base for 0.1 s")
+            sizes = (0.0, 0.5, 1.0, 1.5, 2.0)
+            self.dose = Sweep(f"{self.name}_y", sizes, {self.moment: 5.0}, "push on the base for 0.1 s")
+
+    def span(self, values: Array, duration_s: float) -> tuple[float, float]:
+        """From its moment on for as long as it lasts."""
+        begin = float(values[2])
+        return begin, begin + PUSH_S
 
     def text(self, values: Array) -> str:
         """Its impulse, its link and its time."""
