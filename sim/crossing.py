@@ -10,14 +10,12 @@ from kernels.launch import make_struct, make_zeros
 from kernels.queue import StartRanges
 from kernels.route import WINDOW_S, Trail
 from sim.robots.robot import RobotCfg
-from sim.terrains.conditions.kinds import condition_column
+from sim.terrains.conditions.kinds import CONDITIONS, condition_column
 
 CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 """mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
 FALLEN_TILT_DEG = 60.0
 """A robot that leans further than this has fallen [degrees]."""
-PUSHES = ("push_x", "push_1_x", "push_2_x", "push_3_x")
-"""First numbers of the conditions that push robots."""
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
 _RESOLVED_DT = 0.001
@@ -90,7 +88,8 @@ def make_trail(num_envs: int, robot: RobotCfg, device: str) -> Trail:
     steps = (num_envs, 1 + round(WINDOW_S / robot.control_dt))
     trail = make_zeros(Trail, device, walked=steps, commanded=steps, age=num_envs, here=num_envs, error=num_envs)
     trail.first = condition_column("segment_1_x")
-    trail.pushes = wp.array([condition_column(name) for name in PUSHES], dtype=int, device=device)
+    pushes = [condition_column(condition.genes[0].name) for condition in CONDITIONS.values() if condition.moment]
+    trail.pushes = wp.array(pushes, dtype=int, device=device)
     return trail
 
 

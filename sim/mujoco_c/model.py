@@ -22,7 +22,7 @@ from kernels.route import SEGMENTS as ROUTE_SEGMENTS
 from sim.crossing import GROUND_FRICTION, CrossingCfg, find_highest_command
 from sim.robots.compiled import mj, robot_spec, rotation_matrix
 from sim.robots.robot import RobotCfg
-from sim.terrains.conditions.kinds import condition_genes
+from sim.terrains.conditions.kinds import condition_genes, split_row
 from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.heightmap import QUARTER_TURN, Margins, as_hfield
 from sim.terrains.terrains import PATCHES, GroundMaps
@@ -262,7 +262,8 @@ class Routes:
         values = {gene.name: value for gene, value in zip(condition_genes(), row, strict=False)}
         names = ([f"segment_{k + 1}_{axis}" for axis in ("x", "y", "turn")] for k in range(ROUTE_SEGMENTS))
         self._segments = np.array([[values[name] for name in segment] for segment in names])
-        self._pushed_s = [values["push_time"]] if values["push_x"] or values["push_y"] else []
+        pushes = [values_of for condition, values_of in split_row(row) if condition.moment]
+        self._pushed_s = [time_s for x, y, time_s, *_ in pushes if x or y]
         self._walked, self._told = list[Array](), [np.zeros((count, 3))]
         self.strayed = np.zeros(count, int)
 

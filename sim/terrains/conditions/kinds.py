@@ -73,7 +73,7 @@ class Condition:
     disturbs_last: ClassVar[bool] = False
     """Whether it disturbs what others have disturbed."""
     moment: str | None = None
-    """Its gene that says when it comes [s], if one does."""
+    """Its gene that says when it comes [s], if it is a push: its third, behind those along the way and to the left."""
     asks: ClassVar[Kind] = Kind.CROSS
     """What the robots of a space with it are asked for."""
 
