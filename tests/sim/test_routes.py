@@ -37,7 +37,8 @@ TURN = {"segment_1_x": 0.8, "segment_1_turn": 0.5, "segment_2_x": 0.05, "segment
 
 
 def test_commands_and_strays_are_those_of_a_second_writing():
-    rows = np.stack([row_of(Kind.ROUTE, **TURN), row_of(Kind.ROUTE, push_x=1.0, push_time=4.0), row_of(Kind.STAND)])
+    pushes = {"push_x": 1.0, "push_time": 4.0, "push_3_y": 0.5, "push_3_time": 9.0}
+    rows = np.stack([row_of(Kind.ROUTE, **TURN), row_of(Kind.ROUTE, **pushes), row_of(Kind.STAND)])
     rng, steps, dt = np.random.default_rng(0), 600, ROBOT.control_dt
     task = make_task(CrossingCfg(stray_m=LIMIT), ROBOT)
     episodes, trail = make_episodes(3, "cpu"), make_trail(3, ROBOT, "cpu")
@@ -61,7 +62,7 @@ def test_commands_and_strays_are_those_of_a_second_writing():
         qpos[:, 0] += dt * (np.cos(yaw) * drifts[:, 0] - np.sin(yaw) * drifts[:, 1])
         qpos[:, 1] += dt * (np.sin(yaw) * drifts[:, 0] + np.cos(yaw) * drifts[:, 1])
         yaw = yaw + dt * commands[:, 2]
-    assert most[0] == 0 and 50 < most[1] <= steps - 100 - 50  # of the second the second after a push does not count
+    assert most[0] == 0 and 50 < most[1] <= steps - 100 - 2 * 50  # the second after a push does not count
     assert np.abs(commands[2]).max() == 0.0
 
 
