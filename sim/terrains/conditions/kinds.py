@@ -67,6 +67,8 @@ class Condition:
     """Warp function that varies a robot where its episode begins (:mod:`kernels.conditions`)."""
     disturb: ClassVar[Any] = None
     """Warp function that disturbs a control step."""
+    observed: ClassVar[str] = ""
+    """The only term of an observation (:data:`sim.controllers.described.TERMS`) that it disturbs, if there is one."""
     disturbs_last: ClassVar[bool] = False
     """Whether it disturbs what others have disturbed."""
 

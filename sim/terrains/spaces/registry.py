@@ -3,7 +3,7 @@
 import inspect
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -195,8 +195,8 @@ def load_space(name: str | None) -> TerrainSpace:
     """A space that the command line names; a user's code is run, and :func:`get_space` finds it from then on.
 
     A name is a shipped space's, ``file.py:Space`` or ``module:Space``, a class without arguments, and behind it ground
-    and conditions, as in ``course+friction+push``, or a group of them; None is the paper's space. All of a user's space is tried on three
-    terrains. Code that was loaded before, and has not changed, is not run again.
+    and conditions, as in ``course+friction+push``, or a group of them; None is the paper's space. All of a user's space
+    is tried on three terrains. Code that was loaded before, and has not changed, is not run again.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
     once = "+".join((base, *kinds))
@@ -247,6 +247,16 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     if ground and space.ground:
         raise ValueError(f"the space {base} has its ground already, got {name}: leave +{'+'.join(ground)} out")
     return WiderSpace(space, kinds) if kinds else space
+
+
+def check_observed(conditions: Sequence[str], robot: RobotCfg, terms: Collection[str] | None = None) -> None:
+    """Refuses conditions of what the robot does not sense, or of what a controller with some ``terms`` does not see."""
+    observed = {name: CONDITIONS[name].observed for name in conditions if CONDITIONS[name].observed}
+    senses = {"lin_vel", *(["scan"] if robot.scan_x and robot.scan_y else [])}
+    for who, has in ((f"robot '{robot.name}'", senses), ("the controller", terms)):
+        if has is not None and (blind := [name for name, term in observed.items() if term not in has]):
+            wrong = ", ".join(f"+{name}" for name in blind)
+            raise ValueError(f"{who} does not observe {observed[blind[0]]}, which {wrong} disturb: leave them out")
 
 
 def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> TerrainSpace:
