@@ -67,7 +67,7 @@ class Disturbed:
     map_pose: wp.array2d[wp.spatial_vector]
     """Where the height map had the robot at the last control steps, shape (num_envs, 1 + max_map_steps)."""
     map_drift: wp.array2d[wp.spatial_vector]
-    """Drift of the map up to the last whole second, of this control step and the next in turns, shape (num_envs, 2)."""
+    """Drift of the map over its size, of this control step and the next in turns, shape (num_envs, 2)."""
     held: wp.array2d[float]
     """Height of the base over the ground as each scan point last had it [m], shape (num_envs, num_scan_points)."""
 

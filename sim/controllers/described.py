@@ -457,7 +457,7 @@ def read_speed_limits(policy: str | Path) -> tuple[float, float]:
 def observed_terms(policy: str | Path) -> set[str] | None:
     """Which of :data:`TERMS` a controller observes; None if no description says it."""
     terms = _read_terms(policy)
-    return terms and {term.term for term in terms}
+    return None if terms is None else {term.term for term in terms}
 
 
 def _read_terms(policy: str | Path) -> tuple[Term, ...] | None:

@@ -34,17 +34,17 @@ def _draw(step: DisturbedStep, env: int, number: int) -> float:
 
 @wp.func
 def _drift(step: DisturbedStep, env: int, age: int, notes: bool) -> wp.spatial_vector:
-    """Random walk of the map at a control step, straight from second to second; whoever ``notes`` keeps the sum."""
-    second = wp.max(1, int(wp.round(1.0 / (float(step.every) * step.dt))))
+    """Random walk of the map up to a control step, straight in a second; whoever ``notes`` goes on with it."""
     walked = wp.spatial_vector()
     if age > 0:
         walked = step.memory.map_drift[env, age % 2]
-    change = wp.spatial_vector()
-    for k in range(6):
-        change[k] = _draw(step, env, _A_SECOND * (age // second) + k)
     if notes:
-        step.memory.map_drift[env, (age + 1) % 2] = walked + wp.where((age + 1) % second == 0, 1.0, 0.0) * change
-    return walked + (float(age % second) / float(second)) * change
+        second = wp.max(1, int(wp.round(1.0 / (float(step.every) * step.dt))))
+        change = wp.spatial_vector()
+        for k in range(6):
+            change[k] = _draw(step, env, _A_SECOND * (age // second) + k) / float(second)
+        step.memory.map_drift[env, (age + 1) % 2] = walked + change
+    return walked
 
 
 @wp.func
@@ -213,7 +213,7 @@ class MapDrift(Misperception):
         Gene(name="tilt", low=0.0, middle=0.025, high=0.05, absent=-1.0, unit="rad", limits=(0.0, 1.0)),
     )
     forms = (("height map drifting by up to {:.3f} m a second", 1.0, 5e-4),
-             ("height map tilting and turning by up to {:.1f} degrees a second", 180 / np.pi, 1e-3))  # fmt: skip
+             ("turning and tilting by up to {:.1f} degrees a second", 180 / np.pi, 1e-3))  # fmt: skip
     dose = Sweep("drift", (0.0, 0.02, 0.04, 0.06, 0.08, 0.1), title="drift of the height map")
 
 
@@ -227,7 +227,7 @@ class MapDelay(Misperception):
 
     name, cause = "map_late", "late map"
     genes = (_map_time("map_delay"), _map_time("map_period"))
-    forms = (("height map {:.0f} ms late", 1e3, 0.005), ("height map renewed every {:.0f} ms", 1e3, 0.005))
+    forms = (("height map {:.0f} ms late", 1e3, 0.005), ("a new one every {:.0f} ms", 1e3, 0.005))
     dose = Sweep("map_delay", (0.0, 0.04, 0.08, 0.12, 0.16, 0.2), title="delay of the height map")
 
 
