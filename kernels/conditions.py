@@ -15,7 +15,9 @@ from typing import Any
 import warp as wp
 
 from kernels.episode import Episodes
+from kernels.heightfield import Terrain
 from kernels.launch import kernel_over
+from kernels.observation import Sensors
 
 Effects = tuple[tuple[Any, int], ...]
 """Warp functions of conditions, each with the column of its first number."""
@@ -67,6 +69,12 @@ class Disturbed:
     """Observations since the episode began, shape (num_envs, observation_size): each column counts for itself."""
     steps: wp.array[int]
     """Physics steps since the episode began, shape (num_envs,)."""
+    map_pose: wp.array2d[wp.spatial_vector]
+    """Where the height map had the robot at the last control steps, shape (num_envs, 1 + max_map_steps)."""
+    map_drift: wp.array2d[wp.spatial_vector]
+    """Drift of the map over its size, of this control step and the next in turns, shape (num_envs, 2)."""
+    held: wp.array2d[float]
+    """Height of the base over the ground as each scan point last had it [m], shape (num_envs, num_scan_points)."""
 
 
 @wp.struct
@@ -79,7 +87,11 @@ class DisturbedStep:
     """Length of the steps that the episodes count [s]."""
     every: int
     """How many of them are a control step."""
+    joint_q: wp.array2d[float]
     joint_qd: wp.array2d[float]
+    terrain: Terrain
+    terrain_of_env: wp.array[int]
+    sensors: Sensors
     observation: wp.array2d[float]
 
 

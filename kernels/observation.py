@@ -56,7 +56,8 @@ def _base_column(step: RobotStep, env: int, k: int) -> float:
 
 
 @wp.func
-def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: Sensors, env: int, k: int) -> float:
+def scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: Sensors, env: int, k: int) -> float:
+    """Column ``k`` of the true height scan."""
     heading = base_heading(joint_q, env)
     x = joint_q[env, 0] + heading[0] * sensors.scan_x[k] - heading[1] * sensors.scan_y[k]
     y = joint_q[env, 1] + heading[1] * sensors.scan_x[k] + heading[0] * sensors.scan_y[k]
@@ -102,7 +103,7 @@ def write_observation(
     elif joint < 3 * num_joints:
         column = step.action[env, joint - 2 * num_joints]
     elif joint < 3 * num_joints + sensors.scan_x.shape[0]:
-        column = _scan_column(step.joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
+        column = scan_column(step.joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
     else:
         column = _sense_column(step, sensors, env, joint - 3 * num_joints - sensors.scan_x.shape[0])
     if k < noise.shape[0]:

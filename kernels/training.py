@@ -151,10 +151,11 @@ def promote_episodes(
 
 @kernel_over("episodes_out.rng")
 def seed_restarts(training: TrainingState, episodes_out: Episodes):
-    """Grid (num_envs,): let the starts of this control step be drawn from its counter; writes ``rng``."""
+    """Grid (num_envs,): give episodes that begin at this control step ``rng`` by its counter; they keep it."""
     env = wp.tid()
     num_envs = episodes_out.rng.shape[0]
-    episodes_out.rng[env] = _random_stream(training.counter[0], _STREAM_START, num_envs, env)
+    if training.ended[env] != 0:
+        episodes_out.rng[env] = _random_stream(training.counter[0], _STREAM_START, num_envs, env)
 
 
 @kernel_over("episodes.steps")

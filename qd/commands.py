@@ -382,9 +382,9 @@ class DoseCommand(RobotFlag, WorkerFlags):
     """Controllers, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped; base=shipped if left
     out."""
     elements: tuple[str, ...] = ()
-    """Obstacles: {obstacles}; grounds: friction, softness; conditions on level ground: {conditions}. All but the
-    conditions if left out. With other values as stairs_up=0.15,0.2,0.25; they may lie beyond what the space course
-    has."""
+    """Obstacles: {obstacles}; grounds: friction, softness; conditions on level ground, those that begin with map_ on
+    random terrains of half their height: {conditions}. All but the conditions if left out. With other values as
+    stairs_up=0.15,0.2,0.25; they may lie beyond what the space course has."""
     at: tuple[str, ...] = ()
     """Other sizes of obstacles beside the one that grows, each NAME=VALUE: tread=0.25 depth=0.3."""
     resolved: bool = False

@@ -33,6 +33,7 @@ from sim.robots.training import NoiseCfg, TrainingCfg
 from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
 from sim.terrains.conditions.kinds import MAX_LATENCY_S, condition_effects
+from sim.terrains.conditions.perception import MAX_MAP_DELAY_S
 
 
 class Simulation:
@@ -250,7 +251,11 @@ class Simulation:
         observed = (self.num_envs, robot.observation_size)
         rows = (self.num_envs, self.bank.conditions.shape[1])
         former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)
-        self.disturbed = make_zeros(Disturbed, self.device, row=rows, age=observed, former=former, steps=self.num_envs)
+        poses = (self.num_envs, 1 + 2 * math.ceil(MAX_MAP_DELAY_S / robot.control_dt))
+        maps = {"map_pose": poses, "map_drift": (self.num_envs, 2), "held": (self.num_envs, len(self.sensors.scan_x))}
+        self.disturbed = make_zeros(
+            Disturbed, self.device, row=rows, age=observed, former=former, steps=self.num_envs, **maps
+        )
         self.disturbed.noise = self.make_noise(NoiseCfg())
         links = wp.array(number_links(robot), dtype=int)
         self._forced = self.dynamics.view_forces(memory=self.disturbed, dt=robot.physics_dt, links=links)
@@ -301,6 +306,7 @@ class Simulation:
         if self.disturbed is not None:
             values = {"dt": dt, "every": round(self.robot.control_dt / dt)}
             values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
+            values["terrain"] = self.bank.terrain
             make_disturb(condition_effects("disturb"))(make_struct(DisturbedStep, self, **values))
 
     def collide(self) -> None:

@@ -45,6 +45,7 @@ _BEYOND = {"first": "before the first", "last": "beyond the last", "invalid": "u
 # Of controllers, in order: the colours are Okabe and Ito's, which are apart for every kind of colour blindness.
 _COLOURS = ("#000000", "#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 _MARKERS = ("o", "s", "^", "v", "P", "X", "<", ">", "p")
+_MAPPED = 0.5  # share of their height that bumps have under errors of the map, which level ground does not show
 _SOFT = (0.015, 0.02, 0.03, 0.04, 0.05, 0.06)
 _GROUNDS = (
     (Quantity(name="friction", low=MIN_FRICTION, high=1.0), (1.0, 0.7, 0.5, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15)),
@@ -95,13 +96,21 @@ class Dose(Sweep):
         return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
 
 
-def _dose_level(name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[Any], NDArray[Any]]) -> Dose:
-    """Level ground, whose map or condition has ``to_genes`` of quantities, shape (num_values, number of its genes)."""
+def _dose_level(
+    name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[Any], NDArray[Any]], height: float = 0.0
+) -> Dose:
+    """Level ground, whose map or condition has ``to_genes`` of quantities, shape (num_values, number of its genes).
+
+    With a ``height``, in place of level ground there are hard-random terrains of that share of their height.
+    """
 
     def make(quantities: Mapping[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         genes = to_genes({**sweep.others, sweep.parameter: quantities[name]})
-        flat = np.zeros((len(genes), SUPER_GAUSSIAN.num_genes))  # bumps of no height
-        return np.tile(np.concatenate([flat, genes], axis=1).astype(np.float32), (count, 1))
+        bumps = np.zeros((count, SUPER_GAUSSIAN.num_genes))  # of no height
+        if height:
+            bumps = SUPER_GAUSSIAN.scaled(SUPER_GAUSSIAN.hard_random(count, rng), height)
+        rows = np.repeat(bumps, len(genes), axis=0), np.tile(genes, (count, 1))
+        return np.concatenate(rows, axis=1).astype(np.float32)
 
     space = f"{SUPER_GAUSSIAN.name}+{name}"
     return Dose(name, sweep.values, title=sweep.title, quantities={name: quantity}, make=make, space=space)
@@ -121,7 +130,8 @@ def all_doses() -> dict[str, Dose]:
     for name, condition in CONDITIONS.items():
         if sweep := condition.dose:
             (gene,) = (gene for gene in condition.genes if gene.name == sweep.parameter)
-            doses[name] = _dose_level(name, sweep, replace(gene, low=max(0.0, gene.low)), condition.to_genes)
+            height = _MAPPED if condition.observed == "scan" else 0.0
+            doses[name] = _dose_level(name, sweep, replace(gene, low=max(0.0, gene.low)), condition.to_genes, height)
     return doses
 
 

@@ -33,12 +33,13 @@ from qd.workers.crosser import open_pipeline
 from qd.workers.invalid import WARNED_SHARE, format_reasons, refuse_all_invalid
 from qd.workers.pipeline import Pipeline, PipelineCfg
 from qd.workers.seeds import episode_seeds
+from sim.controllers.described import observed_terms
 from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
 from sim.files.command import BEGAN, Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.registry import at_height, is_user_space, load_space, space_at
+from sim.terrains.spaces.registry import at_height, check_observed, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
 
 
@@ -60,7 +61,9 @@ def start_search(
     terrain_space = load_space(space)
     if height is not None:
         terrain_space = at_height(terrain_space, height)
-    ready = ensure_ready(get_robot(robot), policy, compute, skip_level_ground=skip_level_ground)
+    wanted = get_robot(robot)
+    check_observed(terrain_space.conditions, wanted, observed_terms(policy or wanted.policy_file))
+    ready = ensure_ready(wanted, policy, compute, skip_level_ground=skip_level_ground)
     terrain_space = space_at(terrain_space, height, ready)
     if terrain_space.asks == Kind.ROUTE:
         ensure_stray(ready, policy, compute)

@@ -449,11 +449,20 @@ class Described(torch.nn.Module):
 
 def read_speed_limits(policy: str | Path) -> tuple[float, float]:
     """Least and largest speed ahead that a controller is told [m/s]; infinite where no description limits it."""
-    file = ControllerSpec.parse(policy).file
-    terms = read_controller(Path(file)).observation if file is not None and file.endswith(".toml") else ()
-    told = [term for term in terms if term.term == "command" and "v_x" in (term.order or "")]
+    told = [term for term in _read_terms(policy) or () if term.term == "command" and "v_x" in (term.order or "")]
     low, high = np.array([_told_limits(term)[:, 0] for term in told] or [(-math.inf, math.inf)]).T
     return float(low.max()), float(high.min())
+
+
+def observed_terms(policy: str | Path) -> set[str] | None:
+    """Which of :data:`TERMS` a controller observes; None if no description says it."""
+    terms = _read_terms(policy)
+    return None if terms is None else {term.term for term in terms}
+
+
+def _read_terms(policy: str | Path) -> tuple[Term, ...] | None:
+    file = ControllerSpec.parse(policy).file
+    return read_controller(Path(file)).observation if file is not None and file.endswith(".toml") else None
 
 
 def _told_limits(term: Term) -> NDArray[np.float64]:

@@ -32,6 +32,7 @@ from sim.mujoco_c.model import (
     observations,
     steered_commands,
     step_penalties,
+    surface_heights,
 )
 from sim.robots.actuator_net import ActuatorNet, Array
 from sim.robots.compiled import mj, robot_spec
@@ -68,17 +69,28 @@ def draw_starts(robot: RobotCfg, heights: NDArray[np.float32], seed: int, count:
         step.base_com = base_com
         episodes = make_episodes(count)
         signed = int(np.uint32(seed).astype(np.int32))  # as a kernel takes it
-        episodes.rng.assign(np.array([int(wp.rand_init(signed, k)) for k in range(count)], dtype=np.uint32))
+        streams = np.array([int(wp.rand_init(signed, k)) for k in range(count)], dtype=np.uint32)
+        episodes.rng.assign(streams)
         where = (wp.ones(count, dtype=int), wp.zeros(count, dtype=int), bank.terrain)  # all robots, on the one terrain
         restart_episodes(*where, make_start_ranges(CrossingCfg(), robot), sensors, step, episodes, Rewards())
-    return Starts.of_newton(step.joint_q.numpy(), step.joint_qd.numpy(), base_com.astype(np.float32))
+    return Starts.of_newton(step.joint_q.numpy(), step.joint_qd.numpy(), base_com.astype(np.float32), streams)
 
 
 class EpisodeStates:
     """States of the episodes of one terrain, stepped one by one."""
 
-    def __init__(self, robot: RobotCfg, model: Any, starts: Starts, conditions: Array | None = None) -> None:
-        """From ``starts`` on, under a row of ``conditions`` by which the model is changed; nominal ones if None."""
+    def __init__(
+        self,
+        robot: RobotCfg,
+        model: Any,
+        starts: Starts,
+        conditions: Array | None = None,
+        heights: NDArray[np.floating] | None = None,
+    ) -> None:
+        """From ``starts`` on, under a row of ``conditions`` by which the model is changed; nominal ones if None.
+
+        ``heights`` are those of the terrain [m], shape (nrow, ncol); 0 if None.
+        """
         self.robot = robot
         self.model = model
         self.strength = 1.0
@@ -86,7 +98,11 @@ class EpisodeStates:
         self.former_rows = deque[Array]()
         self._steps = 0
         self.rng = np.random.default_rng(np.frombuffer(starts.qpos.tobytes(), np.uint32))
-        self._conditions = split_row(nominal_row() if conditions is None else conditions)
+        self.streams = np.zeros(len(starts.qpos), np.uint32) if starts.streams is None else starts.streams
+        self.row = nominal_row() if conditions is None else conditions
+        self.qpos = starts.qpos.copy()
+        self._heights = np.zeros((2, 2)) if heights is None else heights
+        self._conditions = split_row(self.row)
         for condition, values in self._conditions:
             condition.begin_plain(self, values)
         self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed
@@ -94,7 +110,6 @@ class EpisodeStates:
         for data, qpos, qvel in zip(self.data, starts.qpos, starts.qvel, strict=True):
             data.qpos[:] = qpos
             data.qvel[:] = qvel
-        self.qpos = starts.qpos.copy()
         self.qvel = starts.qvel.copy()
         self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
         self.torques = np.zeros((len(self.data), robot.num_joints))
@@ -132,6 +147,10 @@ class EpisodeStates:
             self.forces[k] = data.sensordata.reshape(-1, 3)
             self.torques[k] = data.qfrc_actuator[6:]
             self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
+
+    def find_ground(self, x: Array, y: Array) -> Array:
+        """Heights [m] of the terrain at world-local points [m] of any one shape."""
+        return surface_heights(self._heights, x, y)
 
     def disturb(self, rows: Array, running: NDArray[np.intp], step: int) -> Array:
         """Observations (num_episodes, observation_size) as the conditions show them; pushes the running episodes."""
@@ -192,7 +211,8 @@ def cross_in_mujoco_c(
     episode, as :class:`sim.terrains.terrains.Terrains` has. Noise is drawn otherwise than in the parallel simulation.
     """
     model = crossing_model(robot, heights, time_constant_s=time_constant_s, ground=ground)
-    episodes = EpisodeStates(robot, model, starts, None if ground is None else ground.rows[0].astype(np.float64))
+    row = None if ground is None else ground.rows[0].astype(np.float64)
+    episodes = EpisodeStates(robot, model, starts, row, heights)
     count = len(starts.qpos)
     base, feet = (np.isin(robot.geom_names, names) for names in (robot.base_geoms, robot.foot_geoms))
     default = np.array(robot.default_joint_pos)

@@ -43,12 +43,21 @@ class Starts:
     qvel: Array
     """Velocity of the base's origin, world frame [m/s]; its angular velocity, base frame [rad/s]; joint velocities
     [rad/s]; shape (num_episodes, 6 + num_joints)."""
+    streams: NDArray[np.uint32] | None = None
+    """Random streams of the episodes, by which conditions draw, shape (num_episodes,); zeros if None."""
 
     def __getitem__(self, rows: slice) -> "Starts":
-        return Starts(qpos=self.qpos[rows], qvel=self.qvel[rows])
+        streams = None if self.streams is None else self.streams[rows]
+        return Starts(qpos=self.qpos[rows], qvel=self.qvel[rows], streams=streams)
 
     @classmethod
-    def of_newton(cls, joint_q: NDArray[Any], joint_qd: NDArray[Any], base_com: NDArray[Any]) -> "Starts":
+    def of_newton(
+        cls,
+        joint_q: NDArray[Any],
+        joint_qd: NDArray[Any],
+        base_com: NDArray[Any],
+        streams: NDArray[np.uint32] | None = None,
+    ) -> "Starts":
         """Newton's joint state as MuJoCo's.
 
         Newton's has shapes (num, 7 + num_joints), quaternion xyzw, and (num, 6 + num_joints), velocity of the base's
@@ -61,7 +70,7 @@ class Starts:
             to_world = rotation_matrix(quaternion)
             qvel[k, :3] -= np.cross(qvel[k, 3:6], to_world @ base_com)
             qvel[k, 3:6] = to_world.T @ qvel[k, 3:6]
-        return cls(qpos=qpos, qvel=qvel)
+        return cls(qpos=qpos, qvel=qvel, streams=streams)
 
 
 def crossing_model(

@@ -1,5 +1,5 @@
-"""Conditions under which robots cross, which belong to a terrain: payload, delays, noise, pushes, commands and more."""
+"""Conditions under which robots cross, which belong to a terrain: of the robot, pushes, commands, and what it sees."""
 
-from sim.terrains.conditions import command, kinds, pushes
+from sim.terrains.conditions import command, kinds, perception, pushes
 
-__all__ = ["command", "kinds", "pushes"]
+__all__ = ["command", "kinds", "perception", "pushes"]

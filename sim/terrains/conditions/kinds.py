@@ -70,6 +70,8 @@ class Condition:
     """Warp function that disturbs a control step."""
     force: ClassVar[Any] = None
     """Warp function that adds forces in a physics step."""
+    observed: ClassVar[str] = ""
+    """The only term of an observation (:data:`sim.controllers.described.TERMS`) that it disturbs, if there is one."""
     disturbs_last: ClassVar[bool] = False
     """Whether it disturbs what others have disturbed."""
     moment: str | None = None

@@ -3,7 +3,7 @@
 import inspect
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -247,6 +247,16 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     if ground and space.ground:
         raise ValueError(f"the space {base} has its ground already, got {name}: leave +{'+'.join(ground)} out")
     return WiderSpace(space, kinds) if kinds else space
+
+
+def check_observed(conditions: Sequence[str], robot: RobotCfg, terms: Collection[str] | None = None) -> None:
+    """Refuses conditions of what the robot does not sense, or of what a controller with some ``terms`` does not see."""
+    observed = {name: CONDITIONS[name].observed for name in conditions if CONDITIONS[name].observed}
+    senses = {"lin_vel", *(["scan"] if robot.scan_x and robot.scan_y else [])}
+    for who, has in ((f"robot '{robot.name}'", senses), ("the controller", terms)):
+        if has is not None and (blind := [name for name, term in observed.items() if term not in has]):
+            wrong = ", ".join(f"+{name}" for name in blind)
+            raise ValueError(f"{who} does not observe {observed[blind[0]]}, which {wrong} disturb: leave them out")
 
 
 def space_at(space: TerrainSpace, height: float | None, robot: RobotCfg) -> TerrainSpace:

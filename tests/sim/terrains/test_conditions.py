@@ -108,7 +108,8 @@ def test_nominal_conditions_change_no_bit(robot):
 def test_an_episode_depends_on_its_own_conditions_alone(anymal, device):
     """Beside others, in another slot, by a robot that walked under other conditions before."""
     short = dataclasses.replace(anymal, max_duration_s=1.0)
-    many = [genes(), *(genes(**case) for case in CASES.values()), genes(noise=2.0)]
+    seen = {"drift": 0.1, "map_delay": 0.1, "holes": 0.3, "wander": 0.3}
+    many = [genes(), *(genes(**case) for case in CASES.values()), genes(noise=2.0), genes(**seen)]
     rows, seeds = np.stack(many), np.full(len(many), 5, np.uint32)
     sizes = {"replicas": 2, "device": device, "space": SPACE, "cfg": CFG}
     alone = Rollout(short, anymal.policy_file, num_terrains=len(rows), **sizes).evaluate(under_conditions(rows, seeds))

@@ -188,6 +188,7 @@ def test_crossings_begin_along_the_way_with_the_goal_where_it_is(make_task):
 def test_robots_are_trained_under_the_conditions_of_their_terrains(device):
     rows = np.tile(nominal_row(), (2, 1))
     rows[1, [condition_column(name) for name in ("payload", "push_y", "push_time")]] = 0.2, 1.5, 0.1
+    rows[1, [condition_column(name) for name in ("estimate", "wander")]] = 0.0, 0.5  # only what wanders is seen
     ground = GroundMaps(**vars(GroundMaps.plain(2)) | {"conditions": rows})
     tiles = Tiles(heights=np.zeros((2, 161, 321), np.float32), type_of_column=("a", "b"), ground=ground)
     cfg = TaskCfg(curriculum=CURRICULUM, push_interval_s=1e6, added_base_mass=(5.0, 5.0), friction=(1.0, 1.0))
@@ -195,13 +196,16 @@ def test_robots_are_trained_under_the_conditions_of_their_terrains(device):
     masses = task.sim.dynamics.tree.body_mass.numpy()[:, 1]
     whole = task.sim.solver.mjw_model.body_subtreemass.numpy()[0, 1]
     assert masses[:2] == pytest.approx(masses[0]) and masses[2:] == pytest.approx(masses[0] + 0.2 * whole)
-    sideways = []
+    sideways, seen = [], []
     for _ in range(10):
         sideways.append(torch.from_dlpack(task.sim.joint_qd)[:, 1].clone())
+        seen.append(task.observation[2:, :2].clone())
         task.step(torch.zeros(4, 12, device=task.device))
     jump = torch.stack(sideways).diff(dim=0)
     # The push of 0.1 s is made once the first five control steps have ended, before the sixth begins.
     assert (jump[4, 2:] > 0.7).all() and (jump[:4].abs() < 0.5).all() and (jump[4, :2].abs() < 0.5).all()
+    wanders = torch.stack(seen).diff(dim=0)  # straight on, by numbers of the episode that stay the same in its steps
+    assert wanders.abs().min() > 1e-5 and (wanders - wanders[0]).abs().max() < 1e-5
     task.exchange(Tiles(heights=tiles.heights, type_of_column=("a", "b")))
     assert task.sim.dynamics.tree.body_mass.numpy()[:, 1] == pytest.approx(masses[0])
 
