@@ -52,7 +52,13 @@ def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
 
 
 def make_surrogate(space=SUPER_GAUSSIAN, cells=CELLS, weight=0.0, **settings) -> Surrogate:
-    return Surrogate(dataclasses.replace(CFG, **settings), cells, space, np.random.SeedSequence(0), crossed=weight)
+    return Surrogate(
+        dataclasses.replace(CFG, **settings),
+        cells,
+        space,
+        np.random.SeedSequence(0),
+        fitness=dataclasses.replace(FITNESS, crossed=weight),
+    )
 
 
 @pytest.fixture(scope="module")
