@@ -12,8 +12,8 @@ from qd.evaluate.labels import SetsCfg
 from qd.search.methods import METHODS
 from qd.search.presets import PRESETS, SchedulerCfg, read_preset
 from sim.controllers.spec import parse_controllers
-from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
-from sim.files.settings import NonNegativeInt, PositiveInt, Share, select_settings
+from sim.files.command import ControllerFlags, LikelyFlag, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
+from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveInt, Share, select_settings
 from sim.robots.find import get_robot, resolve_robot
 
 _METHOD_HELP = (
@@ -31,7 +31,7 @@ def _compute(flags: WorkerFlags) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArchiveCommand(ControllerFlags, WorkerFlags):
+class ArchiveCommand(ControllerFlags, LikelyFlag, WorkerFlags):
     """Search the terrains on which a controller fails, each in its own way.
 
     Every iteration lets robots cross the terrains that --method asks for, and files each terrain by the proportions of
@@ -77,6 +77,10 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
     other speeds and a little aside, the controller itself. Networks learn which from some failing elites; the fitness
     stays what it is. Only with --method surrogate and --scheduler.again. If left out, 0.95 with these and a panel of
     other controllers, else 0."""
+    likely_weight: Annotated[NonNegativeFloat, tyro.conf.arg(name="fitness.likely")] = 0.0
+    """Lowers the worth of terrains under unlikely conditions in the search: it is multiplied by the probability, to
+    this power, of conditions at least as far from nominal (--likely). The fitness stays what it is. Only in a space
+    with conditions, with --method surrogate and --scheduler.again."""
     intervals: Annotated[int, tyro.conf.arg(name="fitness.intervals")] = 10
     """Intervals of each ratio."""
 
@@ -106,7 +110,7 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         cfg = RunDirectory(Path(folder)).read_cfg()
         settings = {name: getattr(cfg, name) for name in _SETTINGS}
         fitness = {name: getattr(cfg.fitness, name) for name in ("penalties", "alpha", "lam", "crossed")}
-        return cls(**settings, **fitness)
+        return cls(**settings, **fitness, likely_weight=cfg.fitness.likely)
 
     def execute(self) -> None:
         """Searches, and judges what was found."""
@@ -116,16 +120,18 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         from qd.search.directory import free_path
         from qd.search.loop import search, start_search
         from qd.search.results import print_summary
+        from sim.terrains.conditions.likely import choose_likely
         from sim.terrains.spaces.registry import load_space
 
         self.scheduler.check_iterations(self.iterations)  # before anything is loaded
         scheduler = replace(self.scheduler, method=self.method or self.scheduler.method)
-        scheduler.check_crossed(self.crossed or 0.0)
+        scheduler.check_worth(crossed=self.crossed or 0.0, likely=self.likely_weight)
         compute = _compute(self)
         if self.resume is None:
             policy = None
             flags: dict[str, Any] = {"size": self.preset, "height": self.height, "compute": compute}
             flags["skip_level_ground"] = self.skip_level_ground
+            choose_likely(load_space(self.space), self.likely, needed=self.likely_weight > 0.0)  # or refuses
             cfg, robot = start_search(self.robot, self.policy, self.space, **flags)
         elif self.run_dir or self.height is not None:
             flag = "--run-dir" if self.run_dir else "--height"
@@ -140,12 +146,17 @@ class ArchiveCommand(ControllerFlags, WorkerFlags):
         settings = {name: getattr(self, name) for name in _SETTINGS} | {"scheduler": scheduler}
         crossed = usual_crossed(scheduler, robot) if self.crossed is None else self.crossed
         fitness = replace(fitness, alpha=self.alpha, lam=self.lam, crossed=crossed)
+        disturbances: Any = {}
+        if self.likely_weight:
+            known = cfg.fitness.disturbances if self.likely is None else None
+            disturbances = known or choose_likely(cfg.terrain_space, self.likely, needed=True)
+        fitness = replace(fitness, likely=self.likely_weight, disturbances=disturbances)
         cfg = replace(cfg, **settings, fitness=fitness)
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
         archive = search(cfg, path, compute, robot=robot, policy=policy, until=self.until)
         named: dict[str, Any] = {"robot": self.robot, "policy": self.policy, "space": self.space}
         if cfg.preset != "small":
-            archive = judge(path, compute=compute, **named)
+            archive = judge(path, compute=compute, likely=self.likely, **named)
         print_summary(path, archive, **named, skip_level_ground=self.skip_level_ground)
 
 
@@ -173,7 +184,7 @@ class _RunFlags(ControllerFlags, SpaceFlag, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgeCommand(_RunFlags):
+class JudgeCommand(_RunFlags, LikelyFlag):
     """Say which elites of a run are faults of its controller.
 
     fresh: every elite is crossed in 40 fresh episodes, since an elite is the best of many noisy evaluations. It fails
@@ -210,7 +221,7 @@ class JudgeCommand(_RunFlags):
             searched = find_search(run, robot=self.robot, policy=self.policy, space=self.space)
             report_level_ground(searched.robot, searched.policy, named["compute"], must_walk=True)
         most = self.steered or (None if named["compute"].on_gpu else 20)
-        archive = judge(run, stages=self.stages, most_steered=most, **named)
+        archive = judge(run, stages=self.stages, most_steered=most, likely=self.likely, **named)
         own = {"robot": self.robot, "policy": self.policy, "space": self.space}
         print_summary(run, archive, **own, skip_level_ground=self.skip_level_ground)
 

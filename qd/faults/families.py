@@ -4,7 +4,7 @@ Kin are terrains so much alike that they are not independent of each other. Fami
 are no kin of one another. A cause groups failing elites on which parts of one kind stop the robot, such as ridges.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -22,6 +22,7 @@ from qd.search.fitness import FAILING_GOAL_RATE, Evaluation
 from sim.crossing import CrossingCfg
 from sim.terrains.bank import make_heights
 from sim.terrains.conditions.kinds import condition_genes
+from sim.terrains.conditions.likely import Disturbance, find_log_likelihood
 from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import WiderSpace
@@ -41,13 +42,14 @@ _FLAT_M = 1e-3  # RMS height of a flat space [m]
 ORDERS = {
     "cause": "faults first, one a cause",
     "fault": "faults first",
+    "likely": "faults first, the most likely conditions first",
     "goal_rate": "goal rate, the lowest first",
     "collision_rate": "base collision, the most first",
     "fallen_rate": "fallen, the most first",
     "fitness": "fitness, the highest first",
     "family": "families of like terrains",
 }
-"""Orders of elites, with their labels."""
+"""Orders of elites, with their labels; ``likely`` only where it is known how conditions are distributed."""
 
 
 def find_verdicts(archive: Archive) -> NDArray[np.int64]:
@@ -87,6 +89,13 @@ class Ranking(Evaluation):
     ends (:func:`qd.faults.causes.find_causes`). Empty where the elite does not fail."""
     families: NDArray[np.int64]
     """Family of each, shape (N,), numbered from 1 by its worst member."""
+    log_likelihood: NDArray[np.float64] | None = None
+    """Of the conditions of each (:func:`sim.terrains.conditions.likely.find_log_likelihood`), shape (N,), if known."""
+
+    @property
+    def orders(self) -> dict[str, str]:
+        """The orders that are known, with their labels."""
+        return {name: label for name, label in ORDERS.items() if name != "likely" or self.log_likelihood is not None}
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -149,6 +158,10 @@ class Ranking(Evaluation):
         severity = self.by_severity()
         if by == "fault":
             return severity
+        if by == "likely":
+            if self.log_likelihood is None:
+                raise ValueError("order likely needs the distribution of each condition, got none: see --likely")
+            return severity[np.lexsort((-self.log_likelihood[severity], -self.verdict[severity]))]
         if by != "cause":
             values = self.families if by == "family" else np.asarray(getattr(self, by))
             sign = 1 if by in ("family", "goal_rate") else -1
@@ -177,11 +190,13 @@ def rank(
     half_width: float,
     judged: bool = False,
     numbers: Sequence[int] | None = None,
+    likely: Mapping[str, Disturbance] | None = None,
 ) -> Ranking:
     """The ranking of an archive that has elites.
 
     Minimal terrains say best what the cause is. ``half_width`` is that of the robot's stance [m]. ``judged`` leaves out
-    elites whose fresh episodes are invalid; ``numbers`` are elites to rank alone, one a row.
+    elites whose fresh episodes are invalid; ``numbers`` are elites to rank alone, one a row. ``likely`` says
+    how conditions are distributed.
     """
     values, is_fresh = best_values(archive)
     chosen = np.arange(len(archive)) if numbers is None else np.array(numbers, np.int64)
@@ -201,6 +216,7 @@ def rank(
         verdict=np.maximum(find_verdicts(archive), values["goal_rate"] < FAILING_GOAL_RATE),
         causes=tuple(cause and minimal_causes.get(number, cause) for number, cause in known),
         families=families,
+        log_likelihood=None if likely is None else find_log_likelihood(space.condition_rows(archive.genes), likely),
     )
     worst_first = dict.fromkeys(families[ranking.by_severity()].tolist())
     by_worst = {family: number for number, family in enumerate(worst_first, 1)}
@@ -244,15 +260,31 @@ def pick_distinct(distances: NDArray[np.float64], least: float = 1.0) -> NDArray
     return distinct
 
 
-def judged_numbers(archive: Archive, space: TerrainSpace) -> dict[str, Any]:
-    """The numbers of faults (:func:`fault_numbers`), and how many failing elites and faults are distinct."""
+def judged_numbers(
+    archive: Archive, space: TerrainSpace, likely: Mapping[str, Disturbance] | None = None
+) -> dict[str, Any]:
+    """The numbers of faults (:func:`fault_numbers`), how many failing elites and faults are distinct, and which likely.
+
+    ``likely`` says how conditions are distributed, if that is known.
+    """
     numbers = fault_numbers(archive)
     distances = kin_distances(archive.genes[archive.failing], space)
     faults = archive.is_fault[archive.failing]
     known = {"failing": numbers["failing"] is not None, "faults": numbers["faults_panel"] is not None}
     for name, some in (("failing", distances), ("faults", distances[faults][:, faults])):
         numbers[f"{name}_distinct"] = int(pick_distinct(some).sum()) if known[name] else None
+    if likely is not None:
+        values = find_log_likelihood(space.condition_rows(archive.genes), likely)
+        chosen = {"failing": archive.failing, "faults": archive.is_fault}
+        numbers["likeliest"] = {name: _find_likeliest(values, some) for name, some in chosen.items()}
     return numbers
+
+
+def _find_likeliest(log_likelihood: NDArray[np.float64], chosen: NDArray[np.bool_]) -> dict[str, Any] | None:
+    """Number and log-likelihood of the likeliest of some elites, (N,); None where all are ruled out."""
+    values = np.where(chosen, log_likelihood, -np.inf)
+    elite = int(values.argmax()) if len(values) else 0
+    return {"elite": elite, "log_likelihood": float(values[elite])} if np.isfinite(values).any() else None
 
 
 def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:

@@ -42,6 +42,7 @@ from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.mujoco_c.model import NO_SOFTNESS
 from sim.rollout import RolloutResult
+from sim.terrains.conditions.likely import Disturbance, choose_likely
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import at_height
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -63,6 +64,8 @@ class Judging:
     """Terrains for which the stage ``steered`` looks for witnesses at most."""
     step: str = ""
     """What bars say before their label."""
+    likely: Mapping[str, Disturbance] | None = None
+    """How conditions are distributed, if that is known."""
 
     @property
     def origin(self) -> dict[str, Any]:
@@ -436,17 +439,21 @@ def judge(
     policy: str | None = None,
     space: str | None = None,
     most_steered: int | None = None,
+    likely: Path | None = None,
 ) -> Archive:
     """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
     ``stages`` are some of :data:`STAGES`, ``certifiers`` other controllers by name, those of :func:`find_certifiers` if
-    None; robot, policy and space are as :func:`qd.faults.searches.find_search` takes them.
+    None; robot, policy and space are as :func:`qd.faults.searches.find_search` takes them, ``likely`` is the file of
+    :func:`sim.terrains.conditions.likely.choose_likely`.
     """
     if unknown := [name for name in stages if name not in STAGES]:
         raise ValueError(f"stages must be some of {', '.join(STAGES)}, got {', '.join(unknown)}")
     ask = any(STAGES[name].asks_certifiers for name in stages)
     search = find_search(run, robot=robot, policy=policy, space=space)
+    disturbances = choose_likely(search.space, likely)
     with open_judging(search, compute, certifiers, ask=ask) as judging:
+        judging = replace(judging, likely=disturbances)
         archive = search.read_archive()
         for index, name in enumerate(stages):
             STAGES[name].check(archive, judging, stages[:index])
@@ -466,7 +473,7 @@ def _write(archive: Archive, judging: Judging, stage: str) -> None:
     metrics = run.read_metrics() if (run.path / METRICS_FILE).exists() else []
     if len(metrics) >= archive.iterations:  # a search that was stopped has not written its numbers
         numbers |= found_numbers(archive, metrics[: archive.iterations])
-    numbers |= fresh_numbers(archive, archive.fresh) | judged_numbers(archive, judging.search.space)
+    numbers |= fresh_numbers(archive, archive.fresh) | judged_numbers(archive, judging.search.space, judging.likely)
     numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin}
     write_archive(run.path, archive)
     write_atomically(file, to_json(numbers))

@@ -39,8 +39,8 @@ _INVALID = OUTCOMES.index("invalid")
 MAX_FALSE_DISCOVERIES = 0.05
 """Largest expected share of luck among what is significant (Benjamini and Hochberg 1995)."""
 _KINDS = {"searched": "", "resolved": " with contact resolved", "varied": " under varied conditions"}
-FURTHER_NUMBERS = ("witnesses", "crossed_varied", "robust", "faults_mujoco_c")
-"""Numbers of :func:`fault_numbers` that an archive has only if its faults were crossed again."""
+FURTHER_NUMBERS = ("witnesses", "crossed_varied", "robust", "faults_mujoco_c", "likeliest")
+"""Numbers of faults that an archive has only if they were crossed again, or its space has conditions."""
 MINIMAL_FILE = "minimal.npz"
 MINIMAL_NUMBERS_FILE = "minimal.json"
 _ENTRY = ("elite", "cell", "iteration", "bumps", "words", "of", "goal_rate", "goal_interval", "cause", "margin_m")

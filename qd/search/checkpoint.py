@@ -38,6 +38,7 @@ _ADMITTED = {
     "qd.search.presets": ("SchedulerCfg",),
     "qd.search.scheduler": ("Asked", "Scheduler"),
     "qd.search.surrogate.surrogate": ("Surrogate",),
+    "sim.terrains.conditions.likely": ("Disturbance",),
 }
 """Classes that a state may hold, by their modules; methods of search beside them, by their names alone."""
 

@@ -1,7 +1,7 @@
 """Fitness: how hard, and how reliably hard, a terrain is for the controller (the paper's fitness equation)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from kernels.episode import Outcome
 from qd.search.descriptors import Cells, terrain_ratios
-from sim.files.settings import PositiveFloat, Share, check_settings
+from sim.files.settings import NonNegativeFloat, PositiveFloat, Share, check_settings
 from sim.rates import MAX_INVALID_SHARE, typical_outcome
 from sim.rollout import RolloutResult
+from sim.terrains.conditions.likely import Disturbance
 from sim.terrains.terrains import Terrains
 
 FITNESS_FLOOR = -20.0
@@ -39,11 +40,17 @@ class FitnessCfg:
     """Weight of u, the share of episodes without a base collision; u is 0 if none collided."""
     crossed: Share = 0.0
     """How much less what nobody crosses is worth in the search (:func:`find_worth`)."""
+    likely: NonNegativeFloat = 0.0
+    """How much less what is unlikely is worth in the search: the power of the likelihood that it is multiplied by."""
+    disturbances: dict[str, Disturbance] = field(default_factory=dict)
+    """How conditions are distributed, by their names; empty where ``likely`` is 0."""
 
     def __post_init__(self) -> None:
         check_settings(self)
         if len(self.scales) != len(self.penalties):
             raise ValueError(f"scales must be one for each of {', '.join(self.penalties)}, got {self.scales}")
+        if self.likely and not self.disturbances:
+            raise ValueError(f"likely must be 0 where no condition has a distribution, got {self.likely:g}")
 
     def with_penalties(self, names: Sequence[str]) -> "FitnessCfg":
         """The same of some of the penalties alone, which must be at least 2: a single ratio is always 1."""
@@ -178,15 +185,16 @@ def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> 
     return replace(evaluation, fitness=fitness, cell=cells.find_cells(evaluation.ratios, evaluation.collides))
 
 
-def find_worth(fitness: Any, chance: Any, crossed: float) -> Any:
+def find_worth(fitness: Any, chance: Any, crossed: float, likely_share: Any = None) -> Any:
     """What terrains are worth in the search: less of their fitness above the floor, the less anybody crosses them.
 
-    ``chance`` is that somebody does, and ``crossed`` the share that is lost where nobody does. Fitness and chance are
-    arrays or tensors of one shape.
+    ``chance`` is that somebody does, and ``crossed`` the share that is lost where nobody does. ``likely_share`` is what
+    each keeps of the rest, its likelihood to the power :attr:`FitnessCfg.likely`. All are arrays or tensors that fit.
     """
-    if not crossed:
+    if not crossed and likely_share is None:
         return fitness
-    return FITNESS_FLOOR + (fitness - FITNESS_FLOOR) * kept_share(chance, crossed)
+    share = kept_share(chance, crossed)
+    return FITNESS_FLOOR + (fitness - FITNESS_FLOOR) * (share if likely_share is None else share * likely_share)
 
 
 def kept_share(chance: Any, crossed: float) -> Any:

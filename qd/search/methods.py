@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ribs.archives import GridArchive
 
     from qd.search.descriptors import Cells
-    from qd.search.fitness import Evaluation
+    from qd.search.fitness import Evaluation, FitnessCfg
     from sim.terrains.spaces.base import TerrainSpace
 
 Columns = dict[str, NDArray[Any]]
@@ -61,8 +61,7 @@ class Setup:
     seed: int
     emitters: tuple[int, ...]
     """Numbers of the method's emitters among those of the search, ascending."""
-    crossed: float = 0.0
-    """As :class:`qd.search.fitness.FitnessCfg` has it."""
+    fitness: "FitnessCfg"
 
     def stream(self, index: int) -> np.random.SeedSequence:
         """A stream of the search's seed: 0 and 1 are those of archives, 2 and up of emitters, then the surrogate's."""
@@ -268,7 +267,7 @@ class SurrogateSearch(Method):
         super().__init__(cfg, setup)
         self.archive = setup.archive
         stream = setup.stream(2 + cfg.emitters)
-        self.surrogate = Surrogate(cfg, setup.cells, setup.space, stream, crossed=setup.crossed)
+        self.surrogate = Surrogate(cfg, setup.cells, setup.space, stream, fitness=setup.fitness)
 
     def ask(self, emitters: Sequence[int], pending: NDArray[np.float32]) -> NDArray[Any]:
         """What one search by the networks proposes for all of these emitters: no two ask for the same."""
@@ -277,7 +276,8 @@ class SurrogateSearch(Method):
         elites: Any = self.archive.data()
         count = len(emitters) * self.batch_size
         chance = self.surrogate.find_chance(elites["genes"], elites["goal_rate"])
-        worth = find_worth(elites["objective"], chance, self.surrogate.crossed)
+        likely_share = self.surrogate.find_likely_share(elites["genes"])
+        worth = find_worth(elites["objective"], chance, self.surrogate.crossed, likely_share)
         return self.surrogate.propose(count, elites["genes"], elites["index"], worth, pending)
 
     def tell(self, evaluation: Any, rows: Columns, added: Columns, batches: dict[int, slice]) -> None:

@@ -38,12 +38,13 @@ class SchedulerCfg(*_BASES):
         if self.settling >= iterations:
             raise ValueError(f"scheduler.settling must be below the iterations, {iterations}, got {self.settling}")
 
-    def check_crossed(self, crossed: float) -> None:
-        """Refuses that what nobody crosses earns less where no search learns it."""
-        if crossed and not self.learns_crossed:
-            rule = "fitness.crossed must be 0 unless the method is surrogate alone and scheduler.again 1 or more"
-            got = f"got {crossed:g} with {self.method} and {self.again}"
-            raise ValueError(f"{rule}, {got}: give --scheduler.again 90, as preset wide has")
+    def check_worth(self, **weights: float) -> None:
+        """Refuses that what nobody crosses, or what is unlikely, earns less where no search goes by it."""
+        for name, weight in weights.items():
+            if weight and not self.learns_crossed:
+                rule = f"fitness.{name} must be 0 unless the method is surrogate alone and scheduler.again 1 or more"
+                got = f"got {weight:g} with {self.method} and {self.again}"
+                raise ValueError(f"{rule}, {got}: give --scheduler.again 90, as preset wide has")
 
     @property
     def learns_crossed(self) -> bool:

@@ -59,7 +59,7 @@ class Scheduler:
         self.methods: list[Method] = []  # those that have emitters
         for first, name in enumerate(cfg.methods[: cfg.emitters]):
             numbers = tuple(range(first, cfg.emitters, len(cfg.methods)))
-            setup = Setup(space, cells, self._archive, make_archive, seed, numbers, fitness.crossed)
+            setup = Setup(space, cells, self._archive, make_archive, seed, numbers, fitness)
             self.methods.append(METHODS[name](cfg, setup))
         self._pool = Pool(space.num_genes, cells, fitness) if cfg.again else None
         self._asked: list[Asked | None] = [None] * cfg.num_groups
@@ -130,6 +130,8 @@ class Scheduler:
             if (surrogate := self._surrogate) is not None:
                 genes, goal_rate = clipped(self._pool.solutions), self._pool.terrains.goal_rate
                 self._pool.chance = surrogate.find_chance(genes, goal_rate)
+                if (likely_share := surrogate.find_likely_share(genes)) is not None:
+                    self._pool.likely_share = likely_share
             held = self._pool.settle(self._pending_numbers())  # the archive is made anew, of those that hold the cells
             self._archive.clear()
             if len(held):
@@ -145,8 +147,9 @@ class Scheduler:
 
     @property
     def _surrogate(self) -> Any:
-        """The surrogate that learns whether anybody crosses terrains; None where none does."""
-        return getattr(self.methods[0], "surrogate", None) if self._pool and self._pool.fitness.crossed else None
+        """The surrogate that knows what earns less than its fitness; None where nothing does."""
+        fitness = self._pool.fitness if self._pool is not None else None
+        return getattr(self.methods[0], "surrogate", None) if fitness and (fitness.crossed or fitness.likely) else None
 
     def ask_crossed(
         self, most: int, rng: np.random.Generator

@@ -40,7 +40,7 @@ class SearchCfg(Subject):
             raise ValueError(f"an iteration must have {limit}: give fewer replicas or terrains")
         Cells(len(self.fitness.penalties), self.intervals)  # refuses too many
         self.scheduler.check_iterations(self.iterations)
-        self.scheduler.check_crossed(self.fitness.crossed)
+        self.scheduler.check_worth(crossed=self.fitness.crossed, likely=self.fitness.likely)
 
     @property
     def cells(self) -> Cells:

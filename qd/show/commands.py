@@ -5,15 +5,25 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta
+from tyro.conf import Suppress
 
 from sim.controllers.spec import parse_controllers
-from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags, split_values
+from sim.files.command import (
+    ControllerFlags,
+    DeviceFlag,
+    EliteFlags,
+    LikelyFlag,
+    RobotFlag,
+    SpaceFlag,
+    WorkerFlags,
+    split_values,
+)
 from sim.files.settings import NonNegativeInt, PositiveInt
 from sim.robots.find import get_robot
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
+class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags, LikelyFlag):
     """Cross terrains again: how often robots get over, what it costs them, and a figure with their paths.
 
     Terrains are elites of a run, or minimal terrains, or a height map of your own. Elites are numbered by falling
@@ -59,10 +69,10 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
 
         crossing: Any = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
         if self.terrain is None:
-            opened_run = open_run(self.robot, self.run, space=self.space)
+            opened_run = open_run(self.robot, self.run, space=self.space, likely=self.likely)
             return source_from_run(opened_run, self.elite, self.minimal, **crossing)
-        if self.run is not None:
-            raise ValueError("give one of --run and --terrain")
+        if self.run is not None or self.likely is not None:
+            raise ValueError("--run and --likely are about elites: leave them out, or --terrain")
         crossing |= {"size_m": self.size, "scale_m": self.scale, "offset_m": self.offset}
         return source_from_map(self.terrain, get_robot(self.robot or "anymal"), **crossing)
 
@@ -88,6 +98,8 @@ class FilmCommand(ReplayCommand):
     as --policy takes it; or witness, the one that crosses the elite where it is steered (`faultline judge`)."""
     shadows: bool = True
     """Whether the sun casts shadows; without a GPU they take half of the time."""
+    likely: Suppress[Path | None] = None
+    """Films have no numbers."""
 
     def execute(self) -> None:
         """Makes the films."""
@@ -184,7 +196,7 @@ class ExportCommand(ControllerFlags, EliteFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
+class ReportCommand(ControllerFlags, DeviceFlag, LikelyFlag, SpaceFlag):
     """Write one HTML page about a run; it opens from disk, without a network, and prints well.
 
     It begins with what stops the robot, and shows the worst terrains close up at the moment of failure, with another
@@ -208,11 +220,12 @@ class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
         from qd.show.report.report import write_report
 
         named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space, "device": self.device}
+        named["likely"] = self.likely
         write_report(self.run, out=self.out, num_elites=self.elites, tables=self.tables, **named)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewCommand(RobotFlag, EliteFlags):
+class ViewCommand(RobotFlag, EliteFlags, LikelyFlag):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
     It opens on the worst terrain of the commonest cause, of causes that have a fault if any has, one second before the
@@ -253,7 +266,7 @@ class ViewCommand(RobotFlag, EliteFlags):
             from qd.show.view.app import serve
             from qd.show.view.viewed import open_viewed_run
 
-            elite: Any = {"elite": self.elite, "minimal": self.minimal}
+            elite: Any = {"elite": self.elite, "minimal": self.minimal, "likely": self.likely}
             show = open_viewed_run(self.run, robot=self.robot, policies=self.policies, space=self.space, **elite)
             gc.enable()
             serve(show, recorder, host=self.host, port=self.port, cache=self.cache)

@@ -1,5 +1,6 @@
 """The archive of a run, its terrains, and the controller that was searched."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from sim.controllers.spec import SHIPPED, controller_hash, is_same_controller, l
 from sim.files.command import choose_elites, command_line
 from sim.robots.find import get_robot, resolve_robot
 from sim.robots.robot import RobotCfg
+from sim.terrains.conditions.likely import Disturbance, choose_likely, find_log_likelihood
 from sim.terrains.spaces.base import TerrainSpace
 
 
@@ -54,6 +56,8 @@ class OpenedRun:
     robot: RobotCfg
     minima: MinimalTerrains | None = None
     """The minimal terrains of its elites, if there are some."""
+    likely: Mapping[str, Disturbance] | None = None
+    """How conditions are distributed, if that is known."""
 
     @property
     def folder(self) -> Path:
@@ -72,7 +76,16 @@ class OpenedRun:
 
     def rank(self, **options: Any) -> Ranking:
         """Its elites by what is known best of each; ``options`` as of :func:`qd.faults.families.rank`."""
-        return rank(self.archive, self.space, self.minima, half_width=self.robot.half_width, **options)
+        known: Any = {"half_width": self.robot.half_width, "likely": self.likely}
+        return rank(self.archive, self.space, self.minima, **known, **options)
+
+    def log_likelihood(self, genes: NDArray[np.float32]) -> float | None:
+        """Of the conditions of a terrain, (num_genes,); None where it is not known how these are distributed."""
+        return (
+            None
+            if self.likely is None
+            else float(find_log_likelihood(self.space.condition_rows(genes[None]), self.likely)[0])
+        )
 
     def command(self, word: str, **flags: object) -> str:
         """A command about this run as a user types it."""
@@ -152,13 +165,18 @@ class OpenedRun:
         ]
 
 
-def open_run(named: str | None, run: Path | None = None, *, space: str | None = None) -> OpenedRun:
+def open_run(
+    named: str | None, run: Path | None = None, *, space: str | None = None, likely: Path | None = None
+) -> OpenedRun:
     """The archive of a run directory or file; without one the robot's newest under runs/, else its published one.
 
-    Robot and terrain space are as the command line names them; without a robot it is that of the run.
+    Robot and terrain space are as the command line names them; without a robot it is that of the run. ``likely`` is the
+    file of :func:`sim.terrains.conditions.likely.choose_likely`.
     """
     run = find_run(get_robot(named or "anymal"), run)
     archive = read_archive(run)
     robot = resolve_robot(archive.named(), named, run)
     check_space(archive, space)
-    return OpenedRun(path=run, archive=archive, robot=robot, minima=read_minimal(find_directory(run), archive))
+    known: Any = {"minima": read_minimal(find_directory(run), archive)}
+    known["likely"] = choose_likely(archive.terrain_space, likely)
+    return OpenedRun(path=run, archive=archive, robot=robot, **known)

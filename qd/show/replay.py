@@ -130,7 +130,9 @@ def source_from_run(
     def describe_terrain(elite: EliteTerrain) -> ReplayTerrain:
         genes = elite.genes if elite.minimal else None
         request = request_elite(opened_run.archive, elite.number, label=elite.label, minimal=genes, **crossing)
-        about = {"run": str(opened_run.path), "elite": elite.number, "minimal": elite.minimal}
+        about: dict[str, Any] = {"run": str(opened_run.path), "elite": elite.number, "minimal": elite.minimal}
+        if (likelihood := opened_run.log_likelihood(elite.genes)) is not None:
+            about["log_likelihood"] = likelihood if np.isfinite(likelihood) else None
         return ReplayTerrain(request=request, stem=f"{elite.stem}{suffix}", about=about, elite=elite)
 
     return ReplaySource(
@@ -242,6 +244,7 @@ def describe(source: ReplaySource, terrain: ReplayTerrain, recording: Recording)
         columns = [(f"{whole}{label}", values, number) for label, values in stored.items() if values is not None]
         about["parts"] = elite.minimal["words"] if elite.minimal else run.space.describe(elite.genes).splitlines()
         about["same_cell"] = now.valid[0] and cells.are_neighbours(archive.cell[number : number + 1], now.cell)[0]
+        about["likelihood"] = run.log_likelihood(elite.genes)
         about["verdicts"] = describe_judgement(archive, number)
     columns.append(("now", now, 0))
     reasons = invalid_reasons(recording.result())

@@ -111,6 +111,24 @@ def test_what_nobody_crosses_earns_less_by_itself_where_that_can_be_learned_and_
     assert archive("--resume", "a", *MORE, "2") == 0  # 0 is the default of this run now
 
 
+def test_likely_conditions_are_preferred_by_a_model_that_the_run_remembers(capsys):
+    likely = [*TINY, "--fitness.crossed", "0", "--fitness.likely", "0.5"]
+    assert "fitness.likely" in fails(capsys, *likely, "--space", "super_gaussian+push")
+    likely += ["--scheduler.again", "2"]
+    assert "conditions" in fails(capsys, *likely, "--space", "course")
+    Path("mine.toml").write_text('[grip]\nnumbers = {friction = 1}\ndistribution = "exponential"\nsource = "me"\n')
+    pushes = ["--space", "super_gaussian+push"]
+    assert "none for push" in fails(capsys, *TINY, *pushes, "--likely", "mine.toml")
+    grips = ["--space", "super_gaussian+grip", "--likely", "mine.toml"]
+    assert archive(*likely, *grips, "--run-dir", "a") == 0
+    Path("mine.toml").unlink()
+    assert archive("--resume", "a", *MORE, "2") == 0  # by the model of the run
+    assert archive(*likely, *pushes, "--run-dir", "b") == archive(*TINY, *pushes, "--run-dir", "c") == 0
+    a, b, c = (config_of(name)["settings"]["fitness"] for name in "abc")
+    assert a["disturbances"] == {"grip": {"numbers": {"friction": 1.0}, "distribution": "exponential", "source": "me"}}
+    assert [*b["disturbances"]] == ["push"] and c["disturbances"] == {} and (b["likely"], c["likely"]) == (0.5, 0.0)
+
+
 def test_flags_come_to_the_settings_of_the_run():
     flags = ["--method", "map_elites", "--seed", "4", "--fitness.alpha", "0.5", "--fitness.intervals", "5"]
     flags += ["--fitness.penalties", "contact_force", "vel_x", "yaw_rate"]

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from qd.search.descriptors import Cells
-from qd.search.fitness import FITNESS_FLOOR, Evaluation, find_worth
+from qd.search.fitness import FITNESS_FLOOR, Evaluation, FitnessCfg, find_worth
 from qd.search.surrogate.networks import MEMBERS, Moments, Networks, Trainer
 from sim.controllers.loaders import on_stream, prepare_torch
+from sim.terrains.conditions.likely import find_log_likelihood
 from sim.terrains.corridor import SHAPE, corridor_heights, corridor_maps, num_maps
 from sim.terrains.spaces.base import TerrainSpace, clipped
 from sim.terrains.spaces.registry import get_space
@@ -33,7 +34,7 @@ _NUM_RATES = 3  # goal rate, collision rate, collision bit
 _DRAWS = 4  # of the ratios of a terrain, for each network's fitness and collision
 _LABELLED_SHARE = 0.25  # of each batch, drawn among the terrains of which is known whether anybody crosses them
 _STORED = (
-    "cfg", "cells", "crossed", "space_name", "space_sha256", "squared_error", "knows_both", "_rng", "_genes",
+    "cfg", "cells", "fitness", "space_name", "space_sha256", "squared_error", "knows_both", "_rng", "_genes",
     "_targets", "_scale",
 )  # fmt: skip
 _ERROR_STEP = 0.1  # of the known error of ratios toward that of the latest terrains
@@ -56,9 +57,10 @@ class Prediction(NamedTuple):
         """Shape (MEMBERS, N)."""
         return self.numbers[..., -1].sinh()
 
-    def worth(self, crossed: float) -> Tensor:
-        """What terrains are worth in the search, shape (MEMBERS, N)."""
-        return find_worth(self.fitness, self.chance, crossed)
+    def worth(self, crossed: float, likely_share: NDArray[np.float64] | None = None) -> Tensor:
+        """What terrains are worth in the search, shape (MEMBERS, N); by their likelihood, if given, of shape (N,)."""
+        likely = None if likely_share is None else torch.from_numpy(likely_share).to(self.chance)
+        return find_worth(self.fitness, self.chance, crossed, likely)
 
     @property
     def collided(self) -> Tensor:
@@ -69,21 +71,21 @@ class Prediction(NamedTuple):
 class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
 
-    ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`. With ``crossed``, which is that of
-    :class:`qd.search.fitness.FitnessCfg`, networks also learn whether anybody crosses a terrain.
+    ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`. With ``crossed`` in the ``fitness``, networks
+    also learn whether anybody crosses a terrain.
     """
 
     def __init__(
-        self, cfg: Any, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence, *, crossed: float = 0.0
+        self, cfg: Any, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence, *, fitness: FitnessCfg
     ) -> None:
         self.cfg = cfg
         self.cells = cells
-        self.crossed = crossed
+        self.fitness = fitness
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
         self._genes = np.zeros((0, space.num_genes), np.int16)
         num_numbers = 2 * cells.num_ratios + 1
-        num_targets = cells.num_ratios + num_numbers + _NUM_RATES + (crossed > 0.0)
+        num_targets = cells.num_ratios + num_numbers + _NUM_RATES + (fitness.crossed > 0.0)
         self._targets = np.zeros((0, num_targets), np.float16)
         self._scale = np.stack([np.zeros(num_numbers), np.ones(num_numbers)]).astype(np.float32)
         self.squared_error: NDArray[np.float32] | None = None
@@ -101,6 +103,11 @@ class Surrogate:
     def space(self) -> TerrainSpace:
         """What genes mean."""
         return get_space(self.space_name, self.space_sha256)
+
+    @property
+    def crossed(self) -> float:
+        """How much less what nobody crosses is worth."""
+        return self.fitness.crossed
 
     @property
     def _capacity(self) -> int:
@@ -246,6 +253,18 @@ class Surrogate:
                 chance[rows] = predicted.chance.mean(0).cpu().numpy()
         return chance
 
+    def find_likely_share(self, genes: NDArray[np.float32]) -> NDArray[np.float64] | None:
+        """Share of their worth that terrains keep by their conditions, (N, num_genes), shape (N,); None if all do."""
+        fitness = self.fitness
+        if not fitness.likely:
+            return None
+        return np.exp(fitness.likely * find_log_likelihood(self.space.condition_rows(genes), fitness.disturbances))
+
+    def _find_worth(self, prediction: Prediction, genes: Tensor) -> Tensor:
+        """What terrains are worth in the search, shape (MEMBERS, N)."""
+        likely_share = self.find_likely_share(genes.cpu().numpy()) if self.fitness.likely else None
+        return prediction.worth(self.crossed, likely_share)
+
     @torch.inference_mode()
     def propose(
         self,
@@ -277,7 +296,8 @@ class Surrogate:
                 prediction = self.predict(expected)
                 cells = self._expected_cells(prediction)
                 inside = cells >= 0
-                best = best.scatter_reduce(0, cells[inside], prediction.worth(self.crossed).mean(0)[inside], "amax")
+                predicted = self._find_worth(prediction, expected).mean(0)
+                best = best.scatter_reduce(0, cells[inside], predicted[inside], "amax")
             searched = self._search(count - len(explored), parents, best, count, draw)
             return torch.cat([explored, searched]).cpu().numpy()
 
@@ -300,7 +320,7 @@ class Surrogate:
                 drawn = (ratios + error * noise).clamp_min(1e-6)
                 drawn = drawn / drawn.sum(-1, keepdim=True)
             reached = self.find_cells(drawn, prediction.collided)
-            worth = prediction.worth(self.crossed)
+            worth = self._find_worth(prediction, genes[children])
             added = torch.where(reached >= 0, (worth - best[reached]).clamp_min(0.0), 0.0)
             gain[children] = added.mean((0, 1))  # to the QD score
             spread[children] = prediction.ratios.std(0, correction=0).sum(1)

@@ -43,16 +43,18 @@ def write_report(
     num_elites: int = 3,
     tables: Path | None = None,
     device: str | None = None,
+    likely: Path | None = None,
 ) -> Path:
     """Writes the page about a search, or about the rounds of a hardening; returns its file, *.html.
 
     The run is a directory of either, or an archive file; the newest search of the robot, else its published archive.
     ``num_elites`` of the worst terrains are shown close up, with another controller beside; ``tables`` of an evaluation
-    are shown if their file is given.
+    are shown if their file is given. ``likely`` is the file of
+    :func:`sim.terrains.conditions.likely.choose_likely`.
     """
     if run is not None and (run / ROUNDS_FILE).exists():
         return write_rounds(run, robot, out)
-    opened_run = open_run(robot, run, space=space)
+    opened_run = open_run(robot, run, space=space, likely=likely)
     archive = opened_run.archive
     ranking = opened_run.rank(judged=True)
     if not len(ranking):
@@ -254,9 +256,10 @@ def _list_elites(ranking: Ranking) -> dict[str, Any]:
             "family": f"{ranking.families[row]}",
             "fitness": f"{ranking.fitness[row]:.1f}",
         }
+        | ({} if (known := ranking.log_likelihood) is None else {"log-likelihood of conditions": f"{known[row]:.1f}"})
         for row in ranking.by_severity().tolist()
     }
-    return {"rows": [*rows.items()], "wide": (5, 6, 7, 8, 9)}
+    return {"rows": [*rows.items()], "wide": (5, 6, 7, 8, 9, 10)}
 
 
 def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:

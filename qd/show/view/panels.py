@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from viser import _messages, uplot
 
 from kernels.penalties import PENALTIES
-from qd.faults.families import ORDERS, summarise_search
+from qd.faults.families import summarise_search
 from qd.show.crossed import ENDINGS
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
@@ -153,7 +153,7 @@ class ArchivePanel:
         with panel.add_tab("Archive"):
             title = f"{show.robot.name} · {show.folder} · {len(show.archive):,} elites"
             gui.add_html(_small(f"{escape(title)}<br><b>{escape(summarise_search(show.ranking, show.archive))}.</b>"))
-            orders = {label: name for name, label in ORDERS.items()}
+            orders = {label: name for name, label in show.ranking.orders.items()}
             choose = partial(tab.shared.post, self._choose)
             _add_choice(gui, "Cause", show.causes(), partial(choose, "cause"))
             _add_choice(gui, "Sort", orders, partial(choose, "order"), f"Fitness is {FITNESS_TEXT}.")

@@ -67,7 +67,7 @@ class ViewedRun(OpenedRun):
 
     @cached_property
     def _orders(self) -> dict[str, NDArray[np.int64]]:
-        return {name: self.ranking.order(name) for name in ORDERS}
+        return {name: self.ranking.order(name) for name in self.ranking.orders}
 
     @cached_property
     def _names(self) -> list[str]:
@@ -177,9 +177,10 @@ def open_viewed_run(
     minimal: str | None = None,
     policies: Sequence[str] = (),
     space: str | None = None,
+    likely: Path | None = None,
 ) -> ViewedRun:
     """What a user asks to see, by the flags of ``faultline view``."""
-    opened_run = open_run(robot, run, space=space)
+    opened_run = open_run(robot, run, space=space, likely=likely)
     if not len(opened_run.archive):
         raise ValueError(f"{opened_run.path} has no elites yet: let its search go on, or give another --run")
     if elite and minimal:

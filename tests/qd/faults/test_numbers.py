@@ -30,6 +30,8 @@ from qd.faults.numbers import (
 )
 from qd.search.archive import CrossedAgain, no_outcomes, no_witnesses
 from sim.terrains.bank import make_heights
+from sim.terrains.conditions.kinds import CONDITIONS
+from sim.terrains.conditions.likely import choose_likely
 from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
 from sim.terrains.spaces.registry import get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -342,6 +344,23 @@ def test_the_first_are_one_of_each_cause_faults_first_and_of_different_families(
     for name in ("goal_rate", "collision_rate", "fallen_rate", "fitness"):
         values = getattr(ranking, name)[ranking.order(name)]
         assert np.all(np.diff(values if name == "goal_rate" else -values) >= 0.0) and name in ORDERS
+
+
+def test_likely_faults_come_first_and_the_likeliest_is_named():
+    space, known = get_space("super_gaussian+push"), judged_archive()
+    pushes = CONDITIONS["push"].to_genes({"push_x": np.array([0.0, 2.0, 1.0, 0.5, 1.5])})
+    genes = np.concatenate([known.genes[:, :64], pushes], axis=1).astype(np.float32)
+    archive = replace(known, genes=genes, space=space.name)
+    ranking = rank(archive, space, half_width=0.4, likely=choose_likely(space))
+    assert replace(ranking, verdict=np.array([1, 1, 4, 4, 0])).order("likely").tolist() == [3, 2, 0, 1, 4]
+    assert "likely" in ranking.orders and "likely" not in ranked(known).orders
+    with pytest.raises(ValueError, match="likely"):
+        ranked(known).order("likely")
+    likeliest = judged_numbers(archive, space, choose_likely(space))["likeliest"]
+    failing = np.flatnonzero(archive.failing)
+    assert likeliest["failing"]["elite"] == failing[ranking.log_likelihood[failing].argmax()]
+    assert likeliest["faults"]["log_likelihood"] == ranking.log_likelihood[archive.is_fault].max()
+    assert "likeliest" not in judged_numbers(archive, space)
 
 
 class Stripes(TerrainSpace):

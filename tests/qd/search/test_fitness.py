@@ -42,6 +42,8 @@ def test_what_nobody_may_cross_is_worth_less_by_hand():
     assert worth == pytest.approx([10.0, -20.0 + 0.4 * 30.0, -20.0 + 0.2 * 8.0])
     fitness = np.array([0.1, 0.2]) / 3.0
     assert find_worth(fitness, np.zeros(2), 0.0).tolist() == fitness.tolist()
+    both = find_worth(np.array([10.0, 10.0]), np.array([1.0, 0.0]), 0.8, np.array([0.5, 0.5]))  # 30 above the floor
+    np.testing.assert_allclose(both, [-5.0, -17.0])
 
 
 @pytest.mark.parametrize(("num_invalid", "valid"), [(5, True), (6, False), (19, False)])

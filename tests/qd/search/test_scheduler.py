@@ -222,6 +222,8 @@ def test_a_cell_is_held_by_what_somebody_crosses_where_that_counts():
         pool.chance = np.array([0.0, 1.0])
         assert holders(pool) == {find_cell(0.25, 0.35, 0.4): holder}
         assert pool.holds.tolist() == [holder == 0, holder == 1] and pool.chance.tolist() == [0.0, 1.0]
+        pool.likely_share = np.array([1.0, 0.01])  # the second is unlikely
+        assert holders(pool) == {find_cell(0.25, 0.35, 0.4): 0} and pool.likely_share.tolist() == [1.0, 0.01]
 
 
 def test_an_invalid_terrain_holds_no_cell_and_is_forgotten():

@@ -12,7 +12,8 @@ from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.search.presets import SchedulerCfg
 from qd.search.surrogate import surrogate as module
 from qd.search.surrogate.networks import MEMBERS, Networks, Trainer
-from qd.search.surrogate.surrogate import Surrogate, label_loss, vary_elites
+from qd.search.surrogate.surrogate import Prediction, Surrogate, label_loss, vary_elites
+from sim.terrains.conditions.likely import choose_likely, find_log_likelihood
 from sim.terrains.corridor import SHAPE, corridor_heights
 from sim.terrains.spaces.base import clipped
 from sim.terrains.spaces.registry import get_space, load_space
@@ -51,8 +52,14 @@ def predicted(search: Surrogate, genes) -> dict[str, np.ndarray]:
     return {name: getattr(prediction, name).cpu().numpy().astype(float) for name in ("ratios", "fitness", "collided")}
 
 
-def make_surrogate(space=SUPER_GAUSSIAN, cells=CELLS, weight=0.0, **settings) -> Surrogate:
-    return Surrogate(dataclasses.replace(CFG, **settings), cells, space, np.random.SeedSequence(0), crossed=weight)
+def make_surrogate(space=SUPER_GAUSSIAN, cells=CELLS, weight=0.0, worth=None, **settings) -> Surrogate:
+    return Surrogate(
+        dataclasses.replace(CFG, **settings),
+        cells,
+        space,
+        np.random.SeedSequence(0),
+        fitness=dataclasses.replace(FITNESS, crossed=weight, **worth or {}),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +103,26 @@ def test_it_learns_from_a_payload_alone():
     genes, truth = loaded(100, 9)
     ratios = predicted(search, genes)["ratios"].mean(axis=0)[:, 0]
     assert np.corrcoef(ratios, truth.ratios[:, 0])[0, 1] > 0.9
+
+
+def test_of_terrains_alike_it_proposes_the_likeliest_where_these_are_worth_more(monkeypatch):
+    space, alike = get_space("super_gaussian+payload"), torch.ones(MEMBERS, 1, 6)
+    elites, entries = space.uniform_random(80, 0), choose_likely(space)
+    same = Prediction(alike / 6.0, 5.0 * alike, -alike[..., :3], alike[..., 0])
+    monkeypatch.setattr(module, "MIN_TERRAINS", 0)
+    wide = lambda genes: Prediction(*(values.expand(-1, len(genes), *values.shape[2:]) for values in same))  # noqa: E731
+    monkeypatch.setattr(Surrogate, "predict", lambda self, genes: wide(genes))
+
+    def propose(**worth):
+        search = make_surrogate(space, worth=worth, candidates=40)
+        return search.propose(1, elites, np.zeros(80, int), np.full(80, -19.0), elites[:0])
+
+    usual, likely = propose(), propose(likely=0.5, disturbances=entries)
+    assert (propose(disturbances=entries) == usual).all()  # bit for bit
+    before, after = (find_log_likelihood(space.condition_rows(genes), entries)[0] for genes in (usual, likely))
+    assert before < after and after > -0.2
+    share = make_surrogate(space, worth={"likely": 0.5, "disturbances": entries}).find_likely_share(usual)
+    np.testing.assert_allclose(share, np.exp(0.5 * before))
 
 
 def trained(maps: torch.Tensor, turned: bool) -> list[torch.Tensor]:
