@@ -1,5 +1,6 @@
 """Recorded crossings in numbers and figures: how they ended, and where."""
 
+import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -127,19 +128,18 @@ def draw_time_line(acting: Sequence[tuple[str, float, float]], recording: Record
     """What acts on the robots of one terrain, from when to when [s], and when their episodes went wrong."""
     outcome = recording.outcome[0]
     failed = np.flatnonzero((outcome != Outcome.GOAL) & (outcome != Outcome.INVALID))
-    figure = new_figure(8.0, 0.8 + 0.3 * len(acting))
+    figure = new_figure(11.0, 0.8 + 0.45 * len(acting))
     axes = figure.subplots()
-    for row, (text, first, last) in enumerate(acting):
+    for row, (_, first, last) in enumerate(acting):
         if first == last:
             axes.plot([first], [row], "v", color="#d55e00")
         else:
-            axes.barh(row, last - first, left=first, height=0.6, color="#56b4e9", alpha=0.6)
-        axes.text(first, row, f" {text}", va="center", fontsize="small")
+            axes.barh(row, last - first, left=first, height=0.6, color="#56b4e9")
     for episode in failed:
         axes.axvline(find_failure_time(recording, int(episode)), color="#000000", alpha=0.3, linewidth=1.0)
-    axes.set(
-        xlabel="time [s]; a line where a robot fails", yticks=[], xlim=(0.0, max(last for *_, last in acting) + 0.5)
-    )
+    labels = [textwrap.fill(text, 52) for text, *_ in acting]
+    axes.set_yticks(range(len(acting)), labels=labels, fontsize="small")
+    axes.set(xlabel="time [s]; a line where a robot fails", xlim=(0.0, max(last for *_, last in acting) + 0.5))
     axes.set_ylim(len(acting) - 0.5, -0.5)
     return figure
 

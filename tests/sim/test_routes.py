@@ -1,14 +1,16 @@
 """Routes and stands: what is commanded and what counts as off it, against a second writing, and how episodes end."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 
-from kernels.episode import Kind, make_episodes
+from kernels.episode import Kind, Outcome, make_episodes
 from kernels.route import follow_routes
 from qd.check import ensure_stray
+from qd.show.crossed import draw_time_line
 from qd.workers.compute import Compute
 from sim.crossing import CrossingCfg, make_task, make_trail
 from sim.files.atomic import read_json
@@ -111,3 +113,17 @@ def test_what_is_asked_for_is_one_thing():
     flat = np.zeros((1, *rollout.sim.bank.heights.shape[1:]), np.float32)
     with pytest.raises(ValueError, match="stray_m"):
         rollout.evaluate(Terrains(heights=flat, seeds=np.zeros(1, np.uint32), ground=ground))
+
+
+def test_what_acts_on_a_robot_is_known_by_its_time():
+    space = load_space("super_gaussian+command+push+payload")
+    genes = space.without(np.zeros((1, space.num_genes), np.float32), range(8))[0]
+    assert space.time_line(genes, 20.0) == []
+    first = {name: 64 + int(np.cumsum([0, 3, 3, 3, 3])[k]) for k, name in enumerate(space.conditions[:5])}
+    genes[first["payload"]] = genes[first["push"]] = genes[first["push"] + 2] = 0.5
+    genes[first["segment_2"] + 2] = 0.8
+    spans = [(first, last) for _, first, last in space.time_line(genes, 20.0)]
+    assert spans == [(0.0, 20.0), (9.0, 9.0), (4.0, 8.0)]
+    recording = SimpleNamespace(outcome=np.array([[Outcome.GOAL]]))
+    (axes,) = draw_time_line(space.time_line(genes, 20.0), recording).axes
+    assert [label.get_text().partition(" ")[0] for label in axes.get_yticklabels()] == ["payload", "pushed", "part"]
