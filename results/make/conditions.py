@@ -1,8 +1,9 @@
 """What breaks the controller under conditions and terrain alone does not, and how much it bears: conditions.json.
 
-Terrains and conditions are searched together. Then the elites that fail are crossed once more, under nominal
-conditions, and without each kind of condition alone, from the same starts, so that a kind that does nothing changes
-nothing. Some that need one kind alone are taken apart. The archive is published in results/<robot>/conditions.
+Terrains and conditions are searched together, by three seeds, and so are routes with pushes. Then the elites that fail
+are crossed once more, under nominal conditions, and without each kind of condition alone, from the same starts, so that
+a kind that does nothing changes nothing. Some that need one kind alone are taken apart. The archives of the first seed
+are published in results/<robot>/conditions and route.
 """
 
 from collections.abc import Sequence
@@ -18,25 +19,32 @@ from qd.search.archive import Archive, goal_rates
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
-from results.make.common import ARCHIVE_FILES, Script, parse
+from results.make.common import ARCHIVE_FILES, COUNTS, Script, parse
 from results.make.spaces import search_space
 from sim.terrains.conditions.kinds import CONDITIONS
-from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
 EPISODES_SEARCHED = 400_000
 _EXAMPLES = 2
 """Of each kind of condition."""
-SPACE = "+".join((SUPER_GAUSSIAN.name, *(name for name, kind in CONDITIONS.items() if not kind.asks)))
+SPACES = {
+    "conditions": "+".join((SUPER_GAUSSIAN.name, *(name for name, kind in CONDITIONS.items() if not kind.asks))),
+    "route": f"{SUPER_GAUSSIAN.name}+command+pushes",
+}
+SEEDS = (0, 1, 2)
 _PUBLISHED = (*ARCHIVE_FILES, "minimal.npz", "minimal.json")
 
 
-def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
-    """Which failing elites are crossed under nominal conditions, and which of these without one kind of condition."""
-    space, rows = get_space(SPACE), np.flatnonzero(archive.failing)
+def needed_conditions(script: Script, archive: Archive, name: str) -> dict[str, Any]:
+    """Which failing elites are crossed under nominal conditions, and which of these without one kind of condition.
+
+    ``name`` is the folder of the search.
+    """
+    space, rows = archive.terrain_space, np.flatnonzero(archive.failing)
     first = len(space.parts(archive.genes[0])) - len(space.conditions) if len(archive) else 0
     seeds = elite_seeds(archive, script.seed, stream=Stream.ABOUT_CONDITIONS)
-    run = script.runs / "conditions"
+    run = script.runs / name
     with Crosser(script.robot, script.compute, cache=run / "crossings") as crosser:
 
         def rates(rows: NDArray[np.int64], taken: Sequence[int], label: str) -> NDArray[np.float64]:
@@ -56,10 +64,9 @@ def needed_conditions(script: Script, archive: Archive) -> dict[str, Any]:
         numbers = cured[(alone == 1) & is_needed]
         numbers = numbers[np.argsort(~archive.is_fault[numbers], kind="stable")]
         examples |= dict.fromkeys(numbers[:_EXAMPLES].tolist(), kind)
-    if examples and not script.small:
+    if examples and not script.small and name in SPACES:  # of the first seed
         minima = minimise(run, compute=script.compute, elite=" ".join(map(str, examples)), judged=True)
     return {
-        "failing": len(rows),
         "failing_again": len(again),
         "nominal_passes": len(cured),
         "confirmed_and_nominal_passes": int(archive.confirmed[cured].sum()),
@@ -83,12 +90,21 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Searches, and takes conditions away."""
     script = parse(__doc__, argv, "conditions.json")
     dose = script.read_dose(conditions=True)
-    cfg = script.search_cfg(episodes=EPISODES_SEARCHED, seed=script.seed, space=SPACE)
-    archive, numbers = search_space(script, "conditions", cfg)
-    needed = needed_conditions(script, archive)
-    script.publish(script.runs / "conditions", script.out.parent / "conditions", _PUBLISHED)
+    searches = dict[str, list[dict[str, Any]]]()
+    for name, space in SPACES.items():
+        searches[name] = []
+        for seed in SEEDS[: 1 if script.small else None]:
+            folder = name if seed == SEEDS[0] else f"{name}-{seed}"
+            cfg = script.search_cfg(episodes=EPISODES_SEARCHED, seed=seed, space=space)
+            archive, numbers = search_space(script, folder, cfg)
+            searches[name].append({"search_seed": seed, **numbers, **needed_conditions(script, archive, folder)})
+        script.publish(script.runs / name, script.out.parent / name, _PUBLISHED)
+    first = searches["conditions"][0]
+    counts = {name: first[name] for name in ("iterations", "reachable_coverage", *COUNTS, "causes")}
+    needed = {name: value for name, value in first.items() if name not in counts}
     passes = needed["nominal_passes"]
-    return script.write({"archive": numbers, "nominal_passes": passes, "conditions": needed, "dose": dose})
+    parts = {"archive": counts, "nominal_passes": passes, "conditions": needed, "searches": searches}
+    return script.write(parts | {"dose": dose})
 
 
 if __name__ == "__main__":
