@@ -142,6 +142,10 @@ def measure_stray(robot: RobotCfg, policy: str, device: str) -> float:
 
     rollout.watch = watch
     rollout.evaluate(terrains)
+    if not sum(map(len, errors)):
+        raise ValueError(
+            f"robot '{robot.name}' must stay up for two seconds on level ground to follow routes, got none"
+        )
     return float(np.quantile(np.concatenate(errors), _STRAY_SHARE))
 
 

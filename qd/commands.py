@@ -144,7 +144,7 @@ class ArchiveCommand(ControllerFlags, LikelyFlag, WorkerFlags):
                 cfg = replace(cfg, space=space.name, space_sha256=space.sha256)
         fitness = cfg.fitness.with_penalties(self.penalties or cfg.fitness.penalties)
         settings = {name: getattr(self, name) for name in _SETTINGS} | {"scheduler": scheduler}
-        crossed = usual_crossed(scheduler, robot) if self.crossed is None else self.crossed
+        crossed = usual_crossed(scheduler, robot, cfg.terrain_space) if self.crossed is None else self.crossed
         fitness = replace(fitness, alpha=self.alpha, lam=self.lam, crossed=crossed)
         disturbances: Any = {}
         if self.likely_weight:

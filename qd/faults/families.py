@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from kernels.episode import Outcome
+from kernels.episode import Kind, Outcome
 from qd.faults.causes import UNCLEAR, describe_commonest, find_causes
 from qd.faults.numbers import TEMPLATES, MinimalTerrains, count_faults, fault_numbers
 from qd.search.archive import Archive
@@ -58,6 +58,8 @@ def find_verdicts(archive: Archive) -> NDArray[np.int64]:
     return np.select(conditions, [4, 3, 2, 1], 0).astype(np.int64)
 
 
+DONE = {Kind.CROSS: "crossed", Kind.ROUTE: "followed", Kind.STAND: "stood"}
+"""What robots have done that did what they were asked for."""
 _WAYS = {
     Outcome.GOAL: "crosses it",
     Outcome.BASE_COLLISION: "hits the ground",
@@ -89,6 +91,8 @@ class Ranking(Evaluation):
     ends (:func:`qd.faults.causes.find_causes`). Empty where the elite does not fail."""
     families: NDArray[np.int64]
     """Family of each, shape (N,), numbered from 1 by its worst member."""
+    asks: Kind = Kind.CROSS
+    """What robots are asked for."""
     log_likelihood: NDArray[np.float64] | None = None
     """Of the conditions of each (:func:`sim.terrains.conditions.likely.find_log_likelihood`), shape (N,), if known."""
 
@@ -126,14 +130,14 @@ class Ranking(Evaluation):
             fallen = 2 * self.fallen_rate[row] > collided
             return way_to_end(Outcome.BASE_COLLISION, fallen), "fallen_rate" if fallen else "collision_rate"
         is_out = (end <= CrossingCfg.lower).any() or (end >= CrossingCfg.upper).any()
-        outcome = Outcome.OUT if is_out else Outcome.TIME_OUT
+        outcome = Outcome.STRAYED if self.asks != Kind.CROSS else Outcome.OUT if is_out else Outcome.TIME_OUT
         fallen = 2 * self.fallen_rate[row] > 1.0
         return way_to_end(outcome, fallen), "fallen_rate" if fallen else "other_rate"
 
     def name(self, row: int) -> str:
         """An elite by its cause and ending: ``ridge: gets stuck, 19 of 20``; ``crossed, 18 of 20`` of others."""
         if not self.failing[row]:
-            return f"crossed, {self.hits('goal_rate', row)} of {self.counted[row]}"
+            return f"{DONE[self.asks]}, {self.hits('goal_rate', row)} of {self.counted[row]}"
         ending, rate = self.ending(row)
         return f"{self.causes[row]}: {ending}, {self.hits(rate, row)} of {self.counted[row]}"
 
@@ -216,6 +220,7 @@ def rank(
         verdict=np.maximum(find_verdicts(archive), values["goal_rate"] < FAILING_GOAL_RATE),
         causes=tuple(cause and minimal_causes.get(number, cause) for number, cause in known),
         families=families,
+        asks=space.asks,
         log_likelihood=None if likely is None else find_log_likelihood(space.condition_rows(archive.genes), likely),
     )
     worst_first = dict.fromkeys(families[ranking.by_severity()].tolist())

@@ -229,12 +229,16 @@ class Steered(Stage):
     name = "steered"
     asks_certifiers = True
 
+    def check(self, archive: Archive, judging: Judging, before: Collection[str]) -> None:
+        """Refuses a search in which robots are told how to move, too."""
+        super().check(archive, judging, before)
+        if judging.search.space.asks != Kind.CROSS:
+            problem = f"no way is sought where robots are told how to move, as in {judging.search.space.name}"
+            raise ValueError(f"{problem}: leave the stage steered out")
+
     def run(self, archive: Archive, judging: Judging) -> Archive:
         """The archive with witnesses of its confirmed elites that no controller certifies, at first one a family."""
         search, crosser = judging.search, judging.crosser
-        if search.space.asks != Kind.CROSS:
-            problem = f"no way is sought where robots are told how to move, as in {search.space.name}"
-            raise ValueError(f"{problem}: leave the stage steered out")
         open_cases = archive.confirmed if archive.resolved_outcomes.any() else archive.failing
         first, others = split_families(archive, np.flatnonzero(open_cases & ~archive.certified_by_controllers))
         rows = np.sort(np.concatenate([np.sort(first), others])[: judging.most_steered])
@@ -451,7 +455,7 @@ def judge(
         raise ValueError(f"stages must be some of {', '.join(STAGES)}, got {', '.join(unknown)}")
     ask = any(STAGES[name].asks_certifiers for name in stages)
     search = find_search(run, robot=robot, policy=policy, space=space)
-    disturbances = choose_likely(search.space, likely)
+    disturbances = (None if likely else search.cfg.fitness.disturbances) or choose_likely(search.space, likely)
     with open_judging(search, compute, certifiers, ask=ask) as judging:
         judging = replace(judging, likely=disturbances)
         archive = search.read_archive()

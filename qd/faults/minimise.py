@@ -116,9 +116,10 @@ class Case:
         return bool(goal_rates(self.counts[trial]) < FAILING_GOAL_RATE)
 
     def best_trial(self, parts: Parts) -> Trial:
-        """The fresh trial of some parts if it was crossed, else that of 20 episodes."""
-        fresh = Trial(parts, fresh=True)
-        return fresh if fresh in self.counts else Trial(parts)
+        """The fresh trial of some parts if it was crossed, else that of 20 episodes; at the moments of the case."""
+        moments = tuple(moment for moment in self.moments if moment[0] in parts)
+        fresh = Trial(parts, moments=moments, fresh=True)
+        return fresh if fresh in self.counts else Trial(parts, moments=moments)
 
     def cause(self, rank: Mapping[int, float]) -> int | None:
         """The part without which most robots arrive, among equals that of the largest ``rank``; None without parts."""
@@ -150,7 +151,10 @@ def find_minimal(case: Case) -> Steps:
 
 
 def _find_latest(case: Case) -> Steps:
-    """The latest moments of parts at which the minimal terrain still fails, one part after another."""
+    """The latest moments of parts at which the minimal terrain still fails, one part after another.
+
+    They count if 40 fresh episodes fail there, too, and no part can be taken away there.
+    """
     moments = ()
     for part, (time_s, latest) in case.later.items():
         if part in case.minimal:
@@ -159,9 +163,15 @@ def _find_latest(case: Case) -> Steps:
             yield from _missing(case, *trials)
             if failing := [trial for trial in trials if case.fails(trial)]:
                 moments = failing[-1].moments
+    if not moments:
+        return ()
     fresh = Trial(case.minimal, moments=moments, fresh=True)
-    yield from _missing(case, fresh)
-    return moments if case.fails(fresh) else ()
+    smaller = [
+        Trial(_rest(case.minimal, part), moments=tuple(moment for moment in moments if moment[0] != part))
+        for part in case.minimal
+    ]
+    yield from _missing(case, fresh, *smaller)
+    return moments if case.fails(fresh) and not any(map(case.fails, smaller)) else ()
 
 
 def _rest(parts: Parts, part: int) -> Parts:

@@ -24,6 +24,7 @@ from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from sim.controllers.spec import controller_hash
 from sim.robots.robot import RobotCfg
+from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.terrains import Terrains
 
 MOST = 500
@@ -34,9 +35,10 @@ USUAL = 0.95
 """How much less what nobody crosses is worth in a search of a robot with a panel (results/make/crossed.py)."""
 
 
-def usual_crossed(scheduler: SchedulerCfg, robot: RobotCfg) -> float:
-    """The default of ``--fitness.crossed``; 0 without a panel, whose certificates are what was measured."""
-    return USUAL if scheduler.learns_crossed and controllers_in(robot.panel) else 0.0
+def usual_crossed(scheduler: SchedulerCfg, robot: RobotCfg, space: TerrainSpace) -> float:
+    """The default of ``--fitness.crossed``; 0 without a panel, whose certificates were measured, and of crossings."""
+    is_known = scheduler.learns_crossed and space.asks == Kind.CROSS and controllers_in(robot.panel)
+    return USUAL if is_known else 0.0
 
 
 class Labeller(ExitStack):
@@ -53,6 +55,8 @@ class Labeller(ExitStack):
             check_fits(name, file, robot, compute.device)
         steers = cfg.terrain_space.asks == Kind.CROSS
         self._walkers = [*panel.values(), *([None] if steers else [])]  # None is the searched controller
+        if not self._walkers:
+            raise ValueError(f"fitness.crossed needs another controller in {robot.panel}, got none: give 0")
         self._hashes = {name: controller_hash(file) for name, file in panel.items()}
         if metrics and (before := metrics[-1]["panel"]) != self._hashes:
             names = ", ".join(sorted({*before} | {*self._hashes})) or "none"

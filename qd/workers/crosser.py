@@ -14,6 +14,7 @@ from typing import get_args
 
 import numpy as np
 
+from kernels.episode import Kind
 from qd.search.progress import Bar
 from qd.workers.cache import Cache, StoredCrossings
 from qd.workers.compute import Compute
@@ -23,7 +24,7 @@ from qd.workers.process import WorkerProcess
 from sim.controllers.spec import controller_hash, resolve_policy
 from sim.files.command import Interrupted
 from sim.files.provenance import code_fingerprint
-from sim.robots.find import get_robot
+from sim.robots.find import get_robot, read_stray
 from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
 from sim.terrains.spaces.registry import space_key
@@ -143,6 +144,7 @@ class Crosser(ExitStack):
         settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s]
         terms = repr(self.robot.training) if cfg.reward else None  # that the reward has
         settings += [terms, code_fingerprint(("kernels", "sim"))]
+        settings += [read_stray(self.robot)] if terrains.space.asks == Kind.ROUTE else []
         key = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:32]
         if key not in self._stored:
             self._stored[key] = StoredCrossings(self._cache, key, self.robot.penalties)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kernels.episode import SEGMENTS, STEERING
+from kernels.episode import SEGMENTS, STEERING, Kind
 from kernels.ground import FIRM, MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
 from sim.terrains.conditions.kinds import condition_genes, nominal_row
 from sim.terrains.spaces.base import TerrainSpace
@@ -40,6 +40,8 @@ class GroundMaps:
         genes, expected = condition_genes(), (len(self), len(nominal_row()))
         if self.rows.shape != expected:
             raise ValueError(f"conditions must have shape {expected}, got {self.rows.shape}")
+        if not np.isin(self.rows[:, -1], [*Kind]).all():
+            raise ValueError(f"what robots are asked for must be one of {[*map(int, Kind)]}, got {self.rows[:, -1]}")
         for gene, values in zip(genes, self.rows.T[:-1], strict=True):
             low, high = gene.limits
             wrong = ~((values >= low - 1e-6) & (values <= high + 1e-6))

@@ -21,6 +21,7 @@ from qd.search.results import print_summary
 from qd.workers.compute import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
+from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 from tests.builders import fresh_values
 from tests.qd import stand_in
 from tests.qd.searches import crossing_by
@@ -99,11 +100,12 @@ def test_what_crosses_again_is_checked_before_robot_and_controller_are(capsys, m
 
 
 def test_what_nobody_crosses_earns_less_by_itself_where_that_can_be_learned_and_a_panel_says_it():
-    robot, wide = get_robot("anymal"), PRESETS["wide"]["scheduler"]
-    assert usual_crossed(wide, robot) == 0.95
+    robot, wide, space = get_robot("anymal"), PRESETS["wide"]["scheduler"], SUPER_GAUSSIAN
+    assert usual_crossed(wide, robot, space) == 0.95
     for scheduler in (replace(wide, method="map_elites"), replace(wide, again=0), PRESETS["small"]["scheduler"]):
-        assert usual_crossed(scheduler, robot) == 0.0
-    assert usual_crossed(wide, replace(robot, name="dog")) == 0.0  # without a panel
+        assert usual_crossed(scheduler, robot, space) == 0.0
+    assert usual_crossed(wide, replace(robot, name="dog"), space) == 0.0  # without a panel
+    assert usual_crossed(wide, robot, get_space("super_gaussian+stand")) == 0.0
     for number, (flags, weight) in enumerate(((["--scheduler.again", "2"], 0.95), ([], 0.0))):
         assert archive(*TINY, *flags, "--run-dir", f"{number}") == 0
         assert config_of(f"{number}")["settings"]["fitness"]["crossed"] == weight

@@ -143,7 +143,7 @@ class Mix:
             genes = (self.elites.spaces[0].hard_random(count, rng),)
         heights = np.concatenate([hand_crafted, np.empty((count, NUM_ROWS, NUM_COLS), np.float32)])
         ground = GroundMaps.plain(first)
-        if any(space.conditions for space in self.elites.spaces):
+        if any(space.has_conditions for space in self.elites.spaces):
             ground = replace(ground, conditions=ground.rows)
         order = [np.arange(first)]
         start = 0
@@ -154,7 +154,7 @@ class Mix:
                 ground = ground.joined(maps or GroundMaps.plain(len(drawn)))
                 order.append(first + drawn)
             start += len(elites)
-        is_plain = not any(space.ground or space.conditions for space in self.elites.spaces)
+        is_plain = not any(space.ground or space.has_conditions for space in self.elites.spaces)
         ground = None if is_plain else ground[np.argsort(np.concatenate(order))]
         return Tiles(heights=heights, type_of_column=(*types, *(self.cfg.mix,) * count), ground=ground)
 

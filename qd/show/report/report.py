@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome
+from kernels.episode import Kind, Outcome
 from qd.evaluate.tables import read_tables
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
@@ -26,6 +26,11 @@ from sim.files.provenance import without_machine
 from sim.recording.recorder import Recording
 from sim.recording.renderer import open_context
 
+_SUCCESS = {
+    Kind.CROSS: "reaches the goal, 12 m ahead,",
+    Kind.ROUTE: "follows its route to the end",
+    Kind.STAND: "stands near its start to the end",
+}
 _OTHER_CAUSES = 3  # beside those of the first pictures; one terrain of each is shown
 _MAX_BARS = 10
 _FAULT = VERDICTS.index("fault")
@@ -166,7 +171,9 @@ def _make_case(
         "time_line": page.encode_picture(draw_time_line(acting, recording)) if in_time else "",
         "figure": "",
         "rate": rate,
-        "rates": page.Table(head=["goal reached", "", "95 % interval"], rows=rows),
+        "rates": page.Table(
+            head=["goal reached" if not opened_run.space.asks else "done", "", "95 % interval"], rows=rows
+        ),
     }
 
 
@@ -188,6 +195,7 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
         controller = "a controller that is not at hand"
     return {
         "archive": archive,
+        "success": _SUCCESS[space.asks],
         "run": opened_run.command,
         "search": search,
         "metrics": metrics,

@@ -213,7 +213,7 @@ class MapDrift(Misperception):
         Gene(name="tilt", low=0.0, middle=0.025, high=0.05, absent=-1.0, unit="rad", limits=(0.0, 1.0)),
     )
     forms = (("height map drifting by up to {:.3f} m a second", 1.0, 5e-4),
-             ("turning and tilting by up to {:.1f} degrees a second", 180 / np.pi, 1e-3))  # fmt: skip
+             ("height map turning and tilting by up to {:.1f} degrees a second", 180 / np.pi, 1e-3))  # fmt: skip
     dose = Sweep("drift", (0.0, 0.02, 0.04, 0.06, 0.08, 0.1), title="drift of the height map")
 
 
@@ -227,7 +227,7 @@ class MapDelay(Misperception):
 
     name, cause = "map_late", "late map"
     genes = (_map_time("map_delay"), _map_time("map_period"))
-    forms = (("height map {:.0f} ms late", 1e3, 0.005), ("a new one every {:.0f} ms", 1e3, 0.005))
+    forms = (("height map {:.0f} ms late", 1e3, 0.005), ("height map new every {:.0f} ms", 1e3, 0.03))
     dose = Sweep("map_delay", (0.0, 0.04, 0.08, 0.12, 0.16, 0.2), title="delay of the height map")
 
 
@@ -251,7 +251,7 @@ class MapGrid(Misperception):
         Gene(name="spacing", low=0.8, middle=1.0, high=1.25, limits=(0.1, 10.0)),
         Gene(name="grain", low=0.0, middle=0.025, high=0.05, absent=-1.0, unit="m", limits=(0.0, 1.0)),
     )
-    forms = (("height map at {:.2f} times its spacing", 1.0, 5e-3), ("heights in steps of {:.3f} m", 1.0, 5e-4))
+    forms = (("height map at {:.2f} times its spacing", 1.0, 5e-3), ("height map in steps of {:.3f} m", 1.0, 5e-4))
     dose = Sweep("grain", (0.0, 0.01, 0.02, 0.03, 0.04, 0.05), title="steps of the heights in the map")
 
 
