@@ -1,7 +1,7 @@
 """Conditions under which robots cross: they vary a robot where its episode begins, and disturb its steps.
 
-A terrain has a row of numbers, the values of all conditions (:mod:`sim.terrains.conditions`). A condition is one or two
-Warp functions, which read their numbers from column ``first`` on:
+A terrain has a row of numbers, the values of all conditions (:mod:`sim.terrains.conditions`). A condition has some
+of three Warp functions, which read their numbers from column ``first`` on:
 
     begin(robot: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int)
     disturb(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int)
