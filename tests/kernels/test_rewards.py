@@ -307,6 +307,7 @@ def test_starts_are_drawn_from_counter_and_environment_alone():
     seeds = []
     for count in (7, 7, 8):
         episodes, training = make_batch(4, count=count)
+        training.ended.fill_(int(Outcome.TIME_OUT))
         seed_restarts(training, episodes)
         seeds.append(episodes.rng.numpy().tolist())
     assert seeds[0] == seeds[1] and len({*seeds[1], *seeds[2]}) == 8

@@ -145,9 +145,9 @@ def draw(streams: Any, numbers: Any) -> Array:
 
 
 class Misperception(Condition):
-    """An error of the height map; some of its numbers in words are its text."""
+    """An error of what the robot sees; its text is the noun, and each number that is not nominal in words."""
 
-    observed = "scan"
+    observed, noun = "scan", "height map"
     forms: ClassVar[tuple[tuple[str, float, float], ...]]
     """Text of each number, its factor, and what it must differ by from the nominal one."""
 
@@ -155,11 +155,12 @@ class Misperception(Condition):
         """What is wrong, each number in a few words."""
         said = zip(self.genes, values, self.forms, strict=True)
         nominal = [gene.to_value(gene.absent) for gene in self.genes]
-        return " and ".join(
+        parts = [
             form.format(factor * value)
             for (gene, value, (form, factor, least)), middle in zip(said, nominal, strict=True)
             if abs(value - middle) >= least
-        )
+        ]
+        return f"{self.noun} {' and '.join(parts)}" if parts else ""
 
 
 class MapShift(Misperception):
@@ -212,8 +213,8 @@ class MapDrift(Misperception):
         Gene(name="drift", low=0.0, middle=0.05, high=0.1, absent=-1.0, unit="m", limits=(0.0, 10.0)),
         Gene(name="tilt", low=0.0, middle=0.025, high=0.05, absent=-1.0, unit="rad", limits=(0.0, 1.0)),
     )
-    forms = (("height map drifting by up to {:.3f} m a second", 1.0, 5e-4),
-             ("height map turning and tilting by up to {:.1f} degrees a second", 180 / np.pi, 1e-3))  # fmt: skip
+    forms = (("drifting by up to {:.3f} m a second", 1.0, 5e-4),
+             ("turning and tilting by up to {:.1f} degrees a second", 180 / np.pi, 1e-3))  # fmt: skip
     dose = Sweep("drift", (0.0, 0.02, 0.04, 0.06, 0.08, 0.1), title="drift of the height map")
 
 
@@ -227,7 +228,7 @@ class MapDelay(Misperception):
 
     name, cause = "map_late", "late map"
     genes = (_map_time("map_delay"), _map_time("map_period"))
-    forms = (("height map {:.0f} ms late", 1e3, 0.005), ("height map new every {:.0f} ms", 1e3, 0.03))
+    forms = (("{:.0f} ms late", 1e3, 0.005), ("new every {:.0f} ms", 1e3, 0.03))
     dose = Sweep("map_delay", (0.0, 0.04, 0.08, 0.12, 0.16, 0.2), title="delay of the height map")
 
 
@@ -239,7 +240,7 @@ class MapHoles(Misperception):
 
     name, cause = "map_holes", "holes in the map"
     genes = (Gene(name="holes", low=0.0, middle=0.25, high=0.5, absent=-1.0, limits=(0.0, 1.0)),)
-    forms = (("{:.0f}% of the height map missing", 100.0, 5e-3),)
+    forms = (("with {:.0f}% of it missing", 100.0, 5e-3),)
     dose = Sweep("holes", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5), title="holes in the height map")
 
 
@@ -251,7 +252,7 @@ class MapGrid(Misperception):
         Gene(name="spacing", low=0.8, middle=1.0, high=1.25, limits=(0.1, 10.0)),
         Gene(name="grain", low=0.0, middle=0.025, high=0.05, absent=-1.0, unit="m", limits=(0.0, 1.0)),
     )
-    forms = (("height map at {:.2f} times its spacing", 1.0, 5e-3), ("height map in steps of {:.3f} m", 1.0, 5e-4))
+    forms = (("at {:.2f} times its spacing", 1.0, 5e-3), ("in steps of {:.3f} m", 1.0, 5e-4))
     dose = Sweep("grain", (0.0, 0.01, 0.02, 0.03, 0.04, 0.05), title="steps of the heights in the map")
 
 
@@ -273,12 +274,13 @@ def _disturb_velocity(step: DisturbedStep, row: wp.array[float], first: int, env
 class VelocityEstimate(Misperception):
     """Factor of the base's velocity as it is observed, and how far it wanders ahead and to the left [m/s]."""
 
-    name, cause, observed = "estimate", "wrong velocity", "lin_vel"
+    name, cause = "estimate", "wrong velocity"
+    observed, noun = "lin_vel", "seen velocity"
     genes = (
         Gene(name="estimate", low=0.0, middle=1.0, high=1.5, limits=(0.0, 10.0)),
         Gene(name="wander", low=0.0, middle=0.25, high=0.5, absent=-1.0, unit="m/s", limits=(0.0, 10.0)),
     )
-    forms = (("velocity seen {:.2f} times as it is", 1.0, 5e-3), ("seen velocity off by up to {:.2f} m/s", 1.0, 5e-3))
+    forms = (("{:.2f} times the true one", 1.0, 5e-3), ("off by up to {:.2f} m/s", 1.0, 5e-3))
     dose = Sweep("wander", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5), title="wandering of the seen velocity")
     disturb = _disturb_velocity
 

@@ -335,7 +335,8 @@ def test_what_nobody_crosses_is_not_proposed_where_it_is_worth_nothing(learned, 
     elites = SUPER_GAUSSIAN.hard_random(60, 0)
     evaluation = crossed(elites, 0)
     hollows = []
-    for search.crossed in (0.0, 1.0):
+    for weight in (0.0, 1.0):
+        search.fitness = dataclasses.replace(search.fitness, crossed=weight)
         genes = search.propose(6, elites, evaluation.cell, np.full(60, -20.0), elites[:0])
         hollows.append(int((genes[:, 7] <= 0.0).sum()))
     assert hollows[0] > 0 == hollows[1]

@@ -196,10 +196,10 @@ def test_errors_in_words():
     assert texts == [
         "height map 0.12 m ahead and 0.05 m to the right of where it is, turned by 6 degrees to the left",
         "height map drifting by up to 0.100 m a second and turning and tilting by up to 2.9 degrees a second",
-        "height map 100 ms late and a new one every 60 ms",
-        "40% of the height map missing",
-        "height map at 1.20 times its spacing and heights in steps of 0.030 m",
-        "velocity seen 0.60 times as it is and seen velocity off by up to 0.40 m/s",
+        "height map 100 ms late and new every 60 ms",
+        "height map with 40% of it missing",
+        "height map at 1.20 times its spacing and in steps of 0.030 m",
+        "seen velocity 0.60 times the true one and off by up to 0.40 m/s",
     ]
     assert condition_texts(nominal_row(), names) == [""] * 6
     assert load_space("course+map+estimate").conditions == names and get_space("course+map").conditions == names[:-1]
