@@ -135,7 +135,6 @@ def make_begin(effects: Effects) -> Callable[..., None]:
     ``conditions`` has shape (num_terrains, number of values). The weights by which the solver softens constraints stay
     those of the robot by its model.
     """
-    functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
 
     @kernel_over("begins", module="unique")
     def begin_conditions(
@@ -155,8 +154,8 @@ def make_begin(effects: Effects) -> Callable[..., None]:
         for k in range(disturbed_out.age.shape[1]):
             disturbed_out.age[env, k] = 0
         disturbed_out.steps[env] = 0
-        for k in range(count):
-            wp.static(functions[k])(robots_out, conditions[t], wp.static(firsts[k]), t, env)
+        for k in range(wp.static(len(effects))):
+            wp.static(effects[k][0])(robots_out, conditions[t], wp.static(effects[k][1]), t, env)
 
     return begin_conditions
 
@@ -164,14 +163,13 @@ def make_begin(effects: Effects) -> Callable[..., None]:
 @cache
 def make_disturb(effects: Effects) -> Callable[..., None]:
     """What disturbs the next control step of all robots: their velocities ``joint_qd`` and what they observe."""
-    functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
 
     @kernel_over("step.observation", module="unique")
     def disturb(step: DisturbedStep):
         """Grid (num_envs, num_columns): the columns of an observation."""
         env, column = wp.tid()
-        for k in range(count):
-            wp.static(functions[k])(step, step.memory.row[env], wp.static(firsts[k]), env, column)
+        for k in range(wp.static(len(effects))):
+            wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env, column)
         step.memory.age[env, column] += 1
 
     return disturb
@@ -180,14 +178,13 @@ def make_disturb(effects: Effects) -> Callable[..., None]:
 @cache
 def make_force(effects: Effects) -> Callable[..., None]:
     """What adds forces to those that the dynamics have found, before constraints are solved."""
-    functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
 
     @kernel_over("step.memory.steps", module="unique")
     def force(step: ForcedStep):
         """Grid (num_envs,)."""
         env = wp.tid()
-        for k in range(count):
-            wp.static(functions[k])(step, step.memory.row[env], wp.static(firsts[k]), env)
+        for k in range(wp.static(len(effects))):
+            wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
         step.memory.steps[env] += 1
 
     return force

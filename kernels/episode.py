@@ -1,5 +1,6 @@
 """An episode on the device, in crossings and in training: its task, its command, and the latch that ends it."""
 
+import math
 from enum import IntEnum
 
 import warp as wp
@@ -51,8 +52,10 @@ STEERING = ("speed", "offset", "heading")
 """Of a segment: speed [m/s], offset of the way to the left of the straight line [m], heading left of the way [rad]."""
 LOOKAHEAD = wp.constant(1.0)
 """Distance ahead of the place that a steered robot is sent to [m]."""
-FALLEN_GRAVITY_Z = wp.constant(-0.5)
-"""Projected gravity at a tilt of 60 degrees, which ends routes and stands."""
+FALLEN_TILT_DEG = 60.0
+"""A robot that leans further than this has fallen [degrees], which ends routes and stands."""
+FALLEN_GRAVITY_Z = wp.constant(-math.cos(math.radians(FALLEN_TILT_DEG)))
+"""Projected gravity at that tilt."""
 STAND_RADIUS = wp.constant(0.5)
 """How far from its start a robot may be that was to stand [m]."""
 PARKING_HEIGHT = wp.constant(50.0)

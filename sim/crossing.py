@@ -14,8 +14,6 @@ from sim.terrains.conditions.kinds import CONDITIONS, condition_column
 
 CAPACITY_OVERFLOWS = 0xFFFF & ~(512 | 1024)
 """mujoco_warp's overflow bits, less those of its two iteration caps: to reach a cap is no fault."""
-FALLEN_TILT_DEG = 60.0
-"""A robot that leans further than this has fallen [degrees]."""
 GROUND_FRICTION = 0.3
 """Below every robot's own: MuJoCo takes the larger of the two, so the robot's friction decides."""
 _RESOLVED_DT = 0.001

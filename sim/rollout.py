@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from kernels.episode import (
+    FALLEN_GRAVITY_Z,
     Kind,
     Outcome,
     begin_episodes,
@@ -28,7 +29,7 @@ from kernels.rewards import Rewards, remember_steps
 from kernels.route import follow_routes
 from sim.controllers.loaders import Policy, PolicySpec, load_policy, prepare_torch
 from sim.controllers.runner import Memory, PolicyRunner
-from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, make_start_ranges, make_task, make_trail
+from sim.crossing import CrossingCfg, SolverCfg, make_start_ranges, make_task, make_trail
 from sim.recording.frames import Frames
 from sim.robots.find import read_stray
 from sim.robots.robot import RobotCfg
@@ -436,7 +437,7 @@ class Rollout:
             penalty_names=robot.penalties,
             outcome=outcome,
             invalidity=read(queue.invalidity).astype(np.uint8),
-            fallen=upright < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
+            fallen=upright < -float(FALLEN_GRAVITY_Z),
             duration_s=(read(queue.steps) * robot.physics_dt).astype(np.float32),
             final_position=pose[..., :3],
             deviation=read(queue.deviation),

@@ -11,9 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome
+from kernels.episode import FALLEN_GRAVITY_Z, Outcome
 from qd.faults.families import way_to_end
-from sim.crossing import FALLEN_TILT_DEG
 from sim.files.figures import new_figure
 from sim.files.intervals import format_rate, wilson_interval
 from sim.rates import typical_outcome
@@ -83,7 +82,7 @@ def leans(recording: Recording, episode: int) -> NDArray[np.bool_]:
     """At which frames of an episode of one terrain the base leans by more than 60 degrees, shape (frames,)."""
     quaternion = recording.base_quaternion[0, episode, : recording.num_frames[0, episode]].astype(np.float64)
     cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
-    return cosine < np.cos(np.deg2rad(FALLEN_TILT_DEG))
+    return cosine < -float(FALLEN_GRAVITY_Z)
 
 
 def find_failure_time(recording: Recording, episode: int) -> float:

@@ -21,7 +21,7 @@ from kernels.rewards import Rewards
 from kernels.state import RobotStep
 from sim.controllers.loaders import Policy, load_policy, prepare_torch
 from sim.controllers.runner import reset_all
-from sim.crossing import FALLEN_TILT_DEG, CrossingCfg, SolverCfg, find_highest_command, make_start_ranges
+from sim.crossing import CrossingCfg, SolverCfg, find_highest_command, make_start_ranges
 from sim.mujoco_c.model import (
     NO_SOFTNESS,
     Routes,
@@ -268,7 +268,7 @@ def cross_in_mujoco_c(
         penalty_names=robot.penalties,
         outcome=outcome[None].astype(np.uint8),
         invalidity=np.where(outcome[None] == Outcome.INVALID, Invalidity.STATE, 0).astype(np.uint8),
-        fallen=upright[None] < np.cos(np.deg2rad(FALLEN_TILT_DEG)),
+        fallen=upright[None] < -float(FALLEN_GRAVITY_Z),
         duration_s=(steps[None] * robot.physics_dt).astype(np.float32),
         final_position=episodes.qpos[None, :, :3].astype(np.float32),
         deviation=deviation[None].astype(np.float32),
