@@ -16,7 +16,7 @@ from sim.controllers.loaders import load_actor
 from sim.controllers.spec import SHIPPED, controller_hash
 from sim.files.command import command_line
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.registry import check_task, load_space, space_at, space_key
+from sim.terrains.spaces.registry import load_space, space_at, space_key
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
 from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
 from train.ppo.learner import Ranks
@@ -114,8 +114,6 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
         return TrainingElites(genes=(np.zeros((0, space.num_genes), np.float32),), spaces=(space,))
     paths = tuple(map(Path, cfg.archive)) or (find_run(robot, published="first"),)
     archives = [read_robot_archive(robot, path, cfg.space) for path in paths]
-    for archive in archives:
-        check_task(archive.terrain_space)
     splits = [split_elites(archive, held_out=cfg.recipe.held_out) for archive in archives]
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):

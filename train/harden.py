@@ -32,7 +32,7 @@ from sim.files.command import Interrupted
 from sim.files.intervals import format_value
 from sim.files.settings import check_settings
 from sim.robots.robot import RobotCfg
-from sim.terrains.spaces.registry import check_task, load_space, space_at
+from sim.terrains.spaces.registry import load_space, space_at
 from train.cfg import FinetuneCfg, HardenCfg, RoundEvaluationCfg, RunCfg
 from train.finetune import finetune, train_specialist
 from train.ppo.checkpoint import CHECKPOINT, read_start
@@ -109,7 +109,6 @@ class _Hardening:
         self.compute = compute
         self.certifiers = certifiers
         self.space = space_at(load_space(cfg.space), None, robot)
-        check_task(self.space)
         self.crossing: dict[str, Any] = {"robot": robot, "compute": compute, "episodes": episodes}
         self.crossing["cache"] = path / "crossings"
         self.policies = {"base": base}  # after each round so far

@@ -45,7 +45,7 @@ _FREE = ("iterations", "archive", "space")
 """Settings that may differ when a training goes on. Of archives and spaces, hashes are compared."""
 
 _ROWS = 100  # over a whole training
-_ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out")
+_ENDS = ("time_out", "base_collision", "tilt", "invalid", "goal", "out", "strayed")
 _HEADER = (
     f"{'left':>8} {'iteration':>10} {'steps/s':>8} {'reward':>7} {'length':>7} {'falls':>6} {'goal':>6} {'v err':>6} "
     f"{'level':>6} {'std':>5}"

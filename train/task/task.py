@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from kernels.episode import Outcome, Task, latch_outcomes, make_episodes, note_base_forces
+from kernels.episode import Kind, Outcome, Task, latch_outcomes, make_episodes, note_base_forces
 from kernels.launch import make_struct
 from kernels.observation import apply_action
 from kernels.queue import StartRanges
 from kernels.rewards import REWARDS, remember_steps
+from kernels.route import follow_routes
 from kernels.training import (
     STATISTICS,
     Rules,
@@ -25,7 +26,8 @@ from kernels.training import (
     seed_restarts,
 )
 from sim.controllers.loaders import prepare_torch
-from sim.crossing import CAPACITY_OVERFLOWS, CrossingCfg, make_start_ranges, make_task
+from sim.crossing import CAPACITY_OVERFLOWS, CrossingCfg, make_start_ranges, make_task, make_trail
+from sim.robots.find import read_stray
 from sim.robots.robot import RobotCfg
 from sim.simulation import Reward, Simulation
 from sim.terrains.bank import TerrainBank
@@ -70,7 +72,8 @@ class CommandTask:
         levels = np.random.default_rng(level_seed).integers(max_level, size=num_envs, endpoint=True, dtype=np.int32)
         levels %= self.tiles.num_levels
         self.sim = self._build_simulation(levels * self.tiles.num_columns + columns, np.random.default_rng(model_seed))
-        self._task = _make_task(cfg, robot)
+        self._task = _make_task(cfg, robot, self.tiles)
+        self.trail = None if self.sim.disturbed is None else make_trail(num_envs, robot, device)
         self._rules = _make_rules(cfg, robot, self.tiles)
         self._ranges = _make_start_ranges(cfg, robot)
         self._noise = self.sim.make_noise(cfg.noise)
@@ -187,13 +190,17 @@ class CommandTask:
         sim.restart(training.ended, self._robot_step, self._ranges, episodes, self._reward.state)
         command_episodes(sim.joint_q, episodes, self._rules, self._task, sim.joint_qd, training)
         dt = self.robot.control_dt
+        if sim.disturbed is not None:
+            row = sim.disturbed.row
+            follow_routes(sim.joint_q, row, self._task, dt, episodes, self.trail, training.command)
         sim.observe(self._robot_step, episodes, dt, self._noise, training.counter, training.observation)
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
 
 
-def _make_task(cfg: TaskCfg, robot: RobotCfg) -> Any:
+def _make_task(cfg: TaskCfg, robot: RobotCfg, tiles: Tiles) -> Any:
     """Goal, command and limits of an episode as a kernel argument; its steps are control steps."""
-    goal = CrossingCfg(base_force=cfg.base_force)
+    has_routes = tiles.ground is not None and (tiles.ground.rows[:, -1] == Kind.ROUTE).any()
+    goal = CrossingCfg(base_force=cfg.base_force, stray_m=read_stray(robot) if has_routes else None)
     if not cfg.crosses:
         endless: dict[str, Any] = {"lower": (-np.inf, -np.inf), "upper": (np.inf, np.inf)}
         goal = replace(goal, yaw_gain=cfg.yaw_gain, max_yaw_rate=cfg.max_yaw_rate, **endless)

@@ -12,7 +12,6 @@ import torch
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from kernels.episode import Kind
 from kernels.ground import PATCH, Ground, make_ground
 from sim.controllers.spec import ControllerSpec, controller_hash, import_object, in_one_line
 from sim.device import host_device
@@ -178,12 +177,6 @@ def _name_kinds(name: str) -> tuple[str, list[str]]:
         base = split[0]
         named += groups[split[2]]
     return base, named
-
-
-def check_task(space: TerrainSpace) -> None:
-    """Refuses terrains to train on that ask robots for something else than to reach the goal."""
-    if space.asks != Kind.CROSS:
-        raise ValueError(f"trainings are of robots that cross, got {space.name}: leave +command and +stand out")
 
 
 def is_user_space(name: str) -> bool:

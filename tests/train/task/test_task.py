@@ -8,7 +8,7 @@ import pytest
 import torch
 import tyro
 
-from kernels.episode import Outcome
+from kernels.episode import Kind, Outcome
 from sim.robots.find import get_robot
 from sim.terrains.bank import make_terrains
 from sim.terrains.conditions.kinds import condition_column, nominal_row
@@ -208,6 +208,28 @@ def test_robots_are_trained_under_the_conditions_of_their_terrains(device):
     assert wanders.abs().min() > 1e-5 and (wanders - wanders[0]).abs().max() < 1e-5
     task.exchange(Tiles(heights=tiles.heights, type_of_column=("a", "b")))
     assert task.sim.dynamics.tree.body_mass.numpy()[:, 1] == pytest.approx(masses[0])
+
+
+def test_robots_are_trained_on_routes_and_to_stand(anymal, device):
+    rows = np.tile(nominal_row(), (3, 1))
+    rows[:, -1] = Kind.CROSS, Kind.ROUTE, Kind.STAND
+    first = condition_column("segment_1_x")
+    rows[1, first : first + 6] = 0.5, -0.2, 0.4, 0.0, 0.0, 0.0  # then a stop
+    ground = GroundMaps(**vars(GroundMaps.plain(3)) | {"conditions": rows})
+    tiles = Tiles(heights=np.zeros((3, 161, 321), np.float32), type_of_column=("a", "b", "c"), ground=ground)
+    cfg = TaskCfg(crosses=True, curriculum=CURRICULUM, episode_s=1.0, push_interval_s=1e6)
+    task = CommandTask(anymal, cfg, num_envs=3, device=device, seed=0, tiles=tiles)
+    commands, ends = [], []
+    for _ in range(50):
+        commands.append(task.observation[:, 9:12].cpu() / torch.tensor([2.0, 2.0, 0.25]))
+        task.step(torch.zeros(3, 12, device=task.device))
+        ends.append(task.end.tolist())
+    crossing, route, stand = torch.stack(commands, dim=1)
+    assert (crossing[:, 0] > 0.6).all() and not stand.any()
+    expected = torch.tensor([0.5 * 0.75, -0.2 * 0.75, 0.4])
+    assert torch.allclose(route[:10], expected.expand(10, 3)) and not route[10:20].any()
+    assert torch.allclose(route[20:], torch.tensor([0.75, 0.0, 0.0]).expand(30, 3))
+    assert ends[-1] == [Outcome.TIME_OUT, Outcome.GOAL, Outcome.GOAL] and not np.any(ends[:-1])
 
 
 def test_what_no_task_can_do_is_refused(shared_task):
