@@ -152,7 +152,8 @@ def witnesses() -> str:
         "around": "around",
         "faults by controllers": "faults_controllers",
         "faults by a witness alone": "faults_witness",
-        "families of all faults": "fault_families",
+        "families of faults by controllers": "fault_families_controllers",
+        "... of all faults": "fault_families",
         "distinct faults": "faults_distinct",
         "minutes": shown("wall_s", form=".1f", factor=1 / 60),
     }

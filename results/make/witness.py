@@ -1,6 +1,7 @@
 """Witnesses of the published archives, and what MuJoCo C says of faults: results/<robot>/witness.json.
 
-The archives are judged on by the stages steered, whose time is ``wall_s``, and mujoco_c.
+The archives are judged on by the stages steered, whose time is ``wall_s``, and mujoco_c. Each is a part of its own,
+which is not done again; the part ``measure`` follows them.
 
 ``control`` are plain crossings in place of steered ones: how many would pass for witnesses by luck. ``curve`` says how
 many of some terrains a search crosses in half of 20 coarse episodes, over the episodes that it spends on each.
@@ -16,11 +17,12 @@ import numpy as np
 
 from qd.faults.judge import elite_seeds, judge
 from qd.faults.steer import SteerCfg, cross_half, find_kinds, find_ways, try_ways
-from qd.search.archive import WITNESSES, Archive
+from qd.search.archive import WITNESSES, Archive, read_archive
 from qd.search.directory import RunDirectory
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
 from results.make.common import ARCHIVE_FILES, Script, parse
+from sim.files.atomic import to_json, write_atomically
 from sim.terrains.terrains import Terrains
 
 ARCHIVES = ("archive", "archive_cma_mae")
@@ -33,26 +35,32 @@ _COUNTS = (
 )  # fmt: skip
 
 
-def judge_steered(script: Script, name: str) -> tuple[Archive, dict[str, Any]]:
-    """The archive with its witnesses, judged in a copy of the published run, which it replaces; and its numbers."""
+def judge_steered(script: Script, name: str) -> dict[str, Any]:
+    """Numbers of an archive with its witnesses, judged in a copy of the published run, which it replaces."""
     run = script.runs / "witness" / name
-    if not run.exists():
-        shutil.copytree(script.results / name, run)
-    began = time.perf_counter()
-    archive = judge(run, stages=("steered",), compute=script.compute, most_steered=2 if script.small else None)
-    seconds = time.perf_counter() - began
-    if not script.small:  # a fault takes 20 s of a core
-        archive = judge(run, stages=("mujoco_c",), compute=script.compute)
-    witnesses = archive.witnesses
-    assert witnesses is not None
-    by_walker = {}
+    numbers = script.read_so_far(run / "witness.json")
+    if not numbers:
+        if not run.exists():
+            shutil.copytree(script.results / name, run)
+        began = time.perf_counter()
+        judge(run, stages=("steered",), compute=script.compute, most_steered=2 if script.small else None)
+        numbers = {**script.origin, "wall_s": time.perf_counter() - began}
+        write_atomically(run / "witness.json", to_json(numbers))
+    archive, by_walker = read_archive(run), {}
+    if not script.small:
+        script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
+        if archive.mujoco_c is None:  # a fault takes 20 s of a core
+            archive = judge(run, stages=("mujoco_c",), compute=script.compute)
+            script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
+    summary, witnesses = RunDirectory(run).read_summary(), archive.witnesses
+    assert witnesses is not None and archive.family is not None
     for walker in np.unique(witnesses.walker[witnesses.kind > 0]).tolist():
         kinds = witnesses.kind[witnesses.walker == walker]
         by_walker[walker] = {word: int((kinds == kind).sum()) for kind, word in _KINDS}
-    summary = RunDirectory(run).read_summary()
-    if not script.small:
-        script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
-    return archive, {count: summary.get(count) for count in _COUNTS} | {"by_walker": by_walker, "wall_s": seconds}
+    families = np.unique(archive.family[archive.is_fault & archive.certified_by_controllers])
+    made = {key: numbers[key] for key in ("commit", "device", "date", "wall_s")}
+    counts = {count: summary.get(count) for count in _COUNTS}
+    return counts | {"fault_families_controllers": len(families), "by_walker": by_walker} | made
 
 
 def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np.ndarray) -> dict[str, Any]:
@@ -96,16 +104,19 @@ def elites_to_steer(archive: Archive, rows: np.ndarray, seed: int, times: int) -
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Judges, and measures what luck finds and how much search pays."""
-    script = parse(__doc__, argv, "witness.json")
-    archives = {name: judge_steered(script, name) for name in ARCHIVES[: 1 if script.small else None]}
-    archive = archives["archive"][0]
+    script = parse(__doc__, argv, "witness.json", parts=(*ARCHIVES, "measure"))
+    archives = ARCHIVES[: 1 if script.small else None]
+    judged = {name: judge_steered(script, name) for name in archives if name in (script.parts or archives)}
+    if script.parts and "measure" not in script.parts:
+        return judged
+    judged |= {name: judge_steered(script, name) for name in archives if name not in judged}
+    archive = read_archive(script.runs / "witness" / ARCHIVES[0])
     assert archive.witnesses is not None
     tried = np.flatnonzero(archive.witnesses.walker != "")
     some = np.random.default_rng(script.seed).permutation(tried)[: 2 if script.small else CURVE_TERRAINS]
     with Crosser(script.robot, script.compute) as crosser:
         control = measure_control(script, crosser, archive, tried)
         curve = measure_curve(script, crosser, archive, np.sort(some))
-    judged = {name: numbers for name, (_, numbers) in archives.items()}
     return script.write({"archives": judged, "control": control, "curve": curve})
 
 

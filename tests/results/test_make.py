@@ -239,6 +239,7 @@ def test_a_cell_is_a_number_with_its_interval():
 
 def test_tables_of_witnesses_tell_certificates_by_controllers_from_others(monkeypatch):
     judged = {"witnesses": {"tried": 9, "line": 3, "beside": 2, "around": 1}, "wall_s": 90.0, "fault_families": 6}
+    judged |= {"fault_families_controllers": 5}
     judged |= {"by_walker": {"searched": {"line": 2}}, "faults_controllers": 4, "faults_witness": 3}
     point = {"episodes": 20, "line": 0.25, "beside": 0.5, "around": 0.75}
     curve = [point | {"limit_m": 0.5, "line": 0.375}, point | {"limit_m": None}]
@@ -246,8 +247,8 @@ def test_tables_of_witnesses_tell_certificates_by_controllers_from_others(monkey
     numbers = {"archives": {"archive": judged}, "control": control, "curve": curve}
     monkeypatch.setattr(docs, "read_robots", lambda file: {"Dog": numbers})
     assert docs.witnesses().splitlines()[2:] == [
-        "| Dog | 9 | 3 | 2 | 2 | 1 | 4 | 3 | 6 | 1.5 |",
-        "| Dog, plain crossings in their place | 9 | 0 | - | 0 | 1 | - | - | - | - |",
+        "| Dog | 9 | 3 | 2 | 2 | 1 | 4 | 3 | 5 | 6 | - | 1.5 |",
+        "| Dog, plain crossings in their place | 9 | 0 | - | 0 | 1 | - | - | - | - | - | - |",
     ]
     assert docs.witness_curve().splitlines()[2:] == ["| Dog, 20 episodes | 0.38 | 0.50 | 0.75 | 0.25 | 0.50 | 0.75 |"]
     held = {"hold": 5, "tried": 6, "strong": {"hold": 2, "tried": 3}}
