@@ -12,7 +12,7 @@ from qd.evaluate.labels import SetsCfg
 from qd.search.methods import METHODS
 from qd.search.presets import PRESETS, SchedulerCfg, read_preset
 from sim.controllers.spec import parse_controllers
-from sim.files.command import ControllerFlags, LikelyFlag, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
+from sim.files.command import ControllerFlags, RobotFlag, SpaceFlag, WorkerFlags, peek, split_values
 from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveInt, Share, select_settings
 from sim.robots.find import get_robot, resolve_robot
 
@@ -31,7 +31,7 @@ def _compute(flags: WorkerFlags) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArchiveCommand(ControllerFlags, LikelyFlag, WorkerFlags):
+class ArchiveCommand(ControllerFlags, WorkerFlags):
     """Search the terrains on which a controller fails, each in its own way.
 
     Every iteration lets robots cross the terrains that --method asks for, and files each terrain by the proportions of
@@ -45,8 +45,7 @@ class ArchiveCommand(ControllerFlags, LikelyFlag, WorkerFlags):
     """Iterations to reach; with --resume, more than before extend a finished run."""
     until: Annotated[float, Meta(gt=0, lt=1)] | None = None
     """Ends the search before, once its last tenth brought less than this share of the elites that can be expected to
-    stay in their cells, such as 0.03; asked from 20 iterations with new terrains on. What was asked for by then is
-    still crossed, and the settling iterations follow."""
+    stay in their cells, such as 0.03; asked from 20 iterations with new terrains on."""
     seed: int = 0
     """Seed of everything drawn."""
     resume: Path | None = None
@@ -74,13 +73,14 @@ class ArchiveCommand(ControllerFlags, LikelyFlag, WorkerFlags):
     """Weight of u in the fitness, the share of episodes without base collision; u is 0 if none collided."""
     crossed: Annotated[Share | None, tyro.conf.arg(name="fitness.crossed")] = None
     """Share by which the search lowers the worth of terrains that nobody crosses: neither the robot's panel nor, at
-    other speeds and a little aside, the controller itself. Networks learn which from some failing elites; the fitness
-    stays what it is. Only with --method surrogate and --scheduler.again. If left out, 0.95 with these and a panel of
-    other controllers, else 0."""
+    other speeds and a little aside, the controller itself. Only with --method surrogate and --scheduler.again. If left
+    out, 0.95 with these and a panel of other controllers, else 0."""
     likely_weight: Annotated[NonNegativeFloat, tyro.conf.arg(name="fitness.likely")] = 0.0
-    """Lowers the worth of terrains under unlikely conditions in the search: it is multiplied by the probability, to
-    this power, of conditions at least as far from nominal (--likely). The fitness stays what it is. Only in a space
-    with conditions, with --method surrogate and --scheduler.again."""
+    """Lowers the worth of terrains under unlikely conditions (--likely) in the search, by the power of their
+    probability. Only in a space with conditions, with --method surrogate and --scheduler.again."""
+    likely: Path | None = None
+    """File that says how conditions are distributed, which the run remembers; as sim/terrains/conditions/likely.toml,
+    which is taken if left out. How likely the terrain's shape is, is left out."""
     intervals: Annotated[int, tyro.conf.arg(name="fitness.intervals")] = 10
     """Intervals of each ratio."""
 
@@ -130,12 +130,11 @@ class ArchiveCommand(ControllerFlags, LikelyFlag, WorkerFlags):
         if self.resume is None:
             policy = None
             flags: dict[str, Any] = {"size": self.preset, "height": self.height, "compute": compute}
-            flags["skip_level_ground"] = self.skip_level_ground
+            flags |= {"skip_level_ground": self.skip_level_ground, "likely": self.likely}
             choose_likely(load_space(self.space), self.likely, needed=self.likely_weight > 0.0)  # or refuses
             cfg, robot = start_search(self.robot, self.policy, self.space, **flags)
-        elif self.run_dir or self.height is not None:
-            flag = "--run-dir" if self.run_dir else "--height"
-            raise ValueError(f"--resume goes on with a run as it is, got {flag} too: leave it out")
+        elif self.run_dir or self.likely or self.height is not None:
+            raise ValueError("--resume goes on with a run as it is: leave --run-dir, --likely and --height out")
         else:
             run = find_search(self.resume, robot=self.robot, policy=self.policy, space=self.space)
             robot, policy, cfg = run.robot, run.policy, run.cfg
@@ -145,18 +144,13 @@ class ArchiveCommand(ControllerFlags, LikelyFlag, WorkerFlags):
         fitness = cfg.fitness.with_penalties(self.penalties or cfg.fitness.penalties)
         settings = {name: getattr(self, name) for name in _SETTINGS} | {"scheduler": scheduler}
         crossed = usual_crossed(scheduler, robot, cfg.terrain_space) if self.crossed is None else self.crossed
-        fitness = replace(fitness, alpha=self.alpha, lam=self.lam, crossed=crossed)
-        disturbances: Any = {}
-        if self.likely_weight:
-            known = cfg.fitness.disturbances if self.likely is None else None
-            disturbances = known or choose_likely(cfg.terrain_space, self.likely, needed=True)
-        fitness = replace(fitness, likely=self.likely_weight, disturbances=disturbances)
+        fitness = replace(fitness, alpha=self.alpha, lam=self.lam, crossed=crossed, likely=self.likely_weight)
         cfg = replace(cfg, **settings, fitness=fitness)
         path = self.resume or self.run_dir or free_path(f"{cfg.robot}-{cfg.preset}-{cfg.seed}")
         archive = search(cfg, path, compute, robot=robot, policy=policy, until=self.until)
         named: dict[str, Any] = {"robot": self.robot, "policy": self.policy, "space": self.space}
         if cfg.preset != "small":
-            archive = judge(path, compute=compute, likely=self.likely, **named)
+            archive = judge(path, compute=compute, **named)
         print_summary(path, archive, **named, skip_level_ground=self.skip_level_ground)
 
 
@@ -184,21 +178,13 @@ class _RunFlags(ControllerFlags, SpaceFlag, WorkerFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgeCommand(_RunFlags, LikelyFlag):
+class JudgeCommand(_RunFlags):
     """Say which elites of a run are faults of its controller.
 
-    fresh: every elite is crossed in 40 fresh episodes, since an elite is the best of many noisy evaluations. It fails
-    if under half of the robots reach the goal. resolved: those that fail are crossed in 20 episodes with contact
-    resolved, 1 ms steps and a contact time constant of 3 ms. An elite that fails there too is confirmed. others: other
-    controllers cross those that fail, at the search's settings and with contact resolved. An elite is certified if one
-    of them reaches the goal in half of its episodes of both kinds. A fault is confirmed and certified. steered: of what
-    nobody crosses, ways are sought by which the controller itself, or else another, does: at other speeds, aside.
-    One that is never more than 0.5 m from the straight line certifies, too. varied: faults are crossed again under 20
-    draws of moderate conditions, payload, motor strength, delay, noise and friction. A fault is robust if the
-    controller still crosses under half of them, and another at least half. mujoco_c: 150 faults at random, one a family
-    first, are crossed in MuJoCo C with steps of 1 ms, in 6 episodes, or 10 if these do not decide whether half of 10
-    reach the goal. A fault holds there if the controller crosses under half, and what certifies it at least half.
-    Crossings are kept, but those of steered, so the same command goes on after Ctrl-C.
+    fresh, resolved and others find faults: elites that the robot fails in 40 fresh episodes and, confirmed, with finer
+    physics, and that another controller passes with both, which certifies them. steered looks for ways by which the
+    controller itself crosses what nobody passes, varied and mujoco_c try faults under moderate conditions and in MuJoCo
+    C: docs/faults.md. Crossings are kept, but those of steered, so the same command goes on after Ctrl-C.
     """
 
     stages: tuple[str, ...] = ("fresh", "resolved", "others")
@@ -217,12 +203,12 @@ class JudgeCommand(_RunFlags, LikelyFlag):
         from qd.search.results import print_summary
 
         run, named = self.named()
+        own = {name: named[name] for name in ("robot", "policy", "space")}
         if not self.skip_level_ground:
-            searched = find_search(run, robot=self.robot, policy=self.policy, space=self.space)
+            searched = find_search(run, **own)
             report_level_ground(searched.robot, searched.policy, named["compute"], must_walk=True)
         most = self.steered or (None if named["compute"].on_gpu else 20)
-        archive = judge(run, stages=self.stages, most_steered=most, likely=self.likely, **named)
-        own = {"robot": self.robot, "policy": self.policy, "space": self.space}
+        archive = judge(run, stages=self.stages, most_steered=most, **named)
         print_summary(run, archive, **own, skip_level_ground=self.skip_level_ground)
 
 
@@ -230,20 +216,18 @@ class JudgeCommand(_RunFlags, LikelyFlag):
 class MinimiseCommand(_RunFlags):
     """Find the smallest terrains on which the controller still fails. Which parts of an elite's terrain are needed?
 
-    Robots cross subsets of a failing elite's parts, such as bumps, in 20 episodes each. A subset fails if under half of
-    the robots reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes
-    check it. Then its heights are scaled down together as long as it still fails. That is the margin. The cause is the
-    part without which most robots arrive. Results are in minimal.json, minimal.npz and minimal.png of the run; those of
-    several calls add up. Crossings are kept, so the same command goes on after Ctrl-C.
+    Subsets of a failing elite's parts, such as bumps, are tried in 20 episodes each; 40 fresh ones check the smallest
+    that fails. Then its heights are scaled down together as long as it still fails: the margin. The cause is the part
+    without which the robot passes. minimal.json, minimal.npz and minimal.png of the run have the results of all calls.
+    Crossings are kept, so the same command goes on after Ctrl-C.
     """
 
     elite: str | None = None
     """Numbers of failing elites: one, several as in --elite "0 3", or all that fail. If left out, 200 on a GPU and 3 on
     the CPU: faults first, then confirmed and certified ones, then others that fail."""
     how: Literal["exhaustive", "greedy"] | None = None
-    """exhaustive: robots cross all subsets, from the smallest on, until one fails. greedy: parts are taken away one at
-    a time as long as the rest fails. Where many parts are needed, that takes far fewer crossings. If left out,
-    exhaustive on a GPU, and greedy on the CPU and for terrains of more than 10 parts."""
+    """exhaustive: all subsets, from the smallest on, until one fails. greedy: parts are taken away one at a time. If
+    left out, exhaustive on a GPU, and greedy on the CPU and for terrains of more than 10 parts."""
     judge: bool = False
     """Cross the minimal terrains with contact resolved and by other controllers too, as `faultline judge` does."""
 
@@ -288,11 +272,10 @@ class ImportCommand:
 class CheckCommand(ControllerFlags, WorkerFlags):
     """Look at a robot and its controller before anything is searched or trained.
 
-    It prints joints and geoms as the solver holds them; whether the robot stands in its default pose, and how many
-    contacts it has when it lies on rough ground; whether it walks on flat ground, here and in MuJoCo C; at which height
-    of terrain it crosses about 80 %; and which kerbs and stairs stop it. The exit status is 1 if something must be
-    mended, if it does not walk, or if its speeds in the two simulators differ by over 5 %. Then, or with --why, it says
-    which one change of controller.toml or robot.toml makes it walk best, and the line to write.
+    It prints joints and geoms as the solver holds them; whether the robot stands, and walks on flat ground, here and in
+    MuJoCo C; at which height of terrain it crosses about 80 %; and which kerbs and stairs stop it. The exit status is 1
+    if something must be mended (docs/robots.md). Then, or with --why, it says which one change of controller.toml or
+    robot.toml makes it walk best, and the line to write.
     """
 
     why: bool = False
@@ -321,14 +304,12 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
     """Measure the rates of one controller on terrains or on a pack, or make the paper's tables of several.
 
     Rates say how often the controller gets through, and how large its velocity error is on flat ground. With
-    --policies, --archive, --independent or --sets the command makes tables: any controllers on the same
-    hand-crafted, hard-random and generated terrains, with rewards, penalties and intervals. With --pack it says which
-    terrains of a pack of faults a controller fails. Crossings are stored, so after Ctrl-C the same command goes on.
+    --policies, --archive, --independent or --sets the command makes tables of any controllers on the same terrains.
+    With --pack it says which terrains of a pack of faults a controller fails. Crossings are stored, so after Ctrl-C the
+    same command goes on.
 
-    For continuous integration: `--pack anymal --fail-under .9` exits with status 1 if the goal rate may be lower.
-    `--policies old=A new=B --archive RUN` says which elites of RUN fail newly and which are crossed newly, and exits
-    with status 1 on a regression: the 95 % interval of the goal rate's difference, new minus old, lies below 0. Elites
-    that one of the two was trained on are left out.
+    For continuous integration (docs/testing.md), `--pack anymal --fail-under .9` exits with status 1 if the goal rate
+    may be lower, and `--policies old=A new=B --archive RUN` if B is worse on elites of RUN.
     """
 
     pack: str | None = None
@@ -337,9 +318,8 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
     fail_under: Annotated[float, Meta(ge=0, le=1)] | None = None
     """With --pack: exit with status 1 if the lower end of the 95 % interval of the goal rate is below this."""
     policies: tuple[str, ...] = ()
-    """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped. The
-    others are compared with the first. base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind;
-    their mean is shown too."""
+    """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped, the first
+    to compare with; base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind."""
     out: Path | None = None
     """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
     runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
@@ -383,10 +363,8 @@ class DoseCommand(RobotFlag, WorkerFlags):
     """Measure which real obstacle at which size stops a controller.
 
     One obstacle stands alone on flat ground, and one of its sizes grows: the rise of stairs, the width of a ditch; or
-    the ground is level and its friction falls, or the robot's payload grows. For each value the command measures how
-    many robots reach the goal. Terrains of a value differ in where the obstacle begins, evenly over 1 m, and in the
-    seeds of their episodes. All values and controllers have the same places and seeds. Crossings are stored: the same
-    command goes on.
+    the ground is level and its friction falls, or the robot's payload grows (docs/terrains.md). All values and
+    controllers have the same places and seeds. Crossings are stored: the same command goes on.
     """
 
     policies: tuple[str, ...] = ()

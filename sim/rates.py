@@ -1,9 +1,34 @@
-"""Rates of terrains: the episodes that count, and the typical outcome."""
+"""Rates of terrains: the episodes that count, the typical outcome, and what robots did in words."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome
+from kernels.episode import Kind, Outcome
+
+SUCCESS = {Kind.CROSS: "reaches the goal", Kind.ROUTE: "follows its route", Kind.STAND: "stays standing"}
+"""What a robot does that does what it is asked for; it passes a terrain where it does so half of the time."""
+_FAILURES = {
+    Outcome.BASE_COLLISION: "hits the ground",
+    Outcome.TIME_OUT: "gets stuck",
+    Outcome.OUT: "leaves the terrain",
+    Outcome.TILT: "topples",
+    Outcome.STRAYED: "strays",
+    Outcome.INVALID: "breaks the simulation",
+}
+
+
+def rate_labels(asks: Kind) -> dict[str, str]:
+    """What the rates of a :class:`qd.search.fitness.Evaluation` count, by their names."""
+    collided = {"collision_rate": "base collision", "other_rate": "other failure"}
+    return {"goal_rate": SUCCESS[asks], **collided, "fallen_rate": "fallen"}
+
+
+def way_to_end(outcome: int, asks: Kind, *, fallen: bool = False) -> str:
+    """How an episode ended, as one says of a robot: ``topples`` of one that has failed and fallen."""
+    if outcome == Outcome.GOAL:
+        return SUCCESS[asks]
+    return "topples" if fallen and outcome != Outcome.INVALID else _FAILURES[Outcome(outcome)]
+
 
 MAX_INVALID_SHARE = 0.25
 """A terrain with more than this share of invalid episodes is invalid."""

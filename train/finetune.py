@@ -92,9 +92,8 @@ def _write_onnx(policy: Path, robot: RobotCfg) -> Path:
 def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
     """Trains a search's specialist, by :meth:`FinetuneCfg.specialist`, and writes it to the certifiers of the run.
 
-    The specialist is the controller of the search, trained further on all elites that it fails in fresh episodes. A
-    certificate is a proof of existence, so a certifier may have trained on its terrain. The training works in
-    ``<run>/specialist``.
+    It is the controller of the search, trained further on all elites that it fails in fresh episodes, in
+    ``<run>/specialist``. A certificate is a proof of existence, so a certifier may have trained on its terrain.
     """
     archive = read_robot_archive(robot, run, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]

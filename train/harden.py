@@ -1,8 +1,7 @@
 """Harden a controller: rounds of search and training, until a search no longer finds what breaks it.
 
-Every step is a run of its own under the directory of the hardening: search-0, tune-1, search-1 and so on. Searches and
-trainings go on from their checkpoints, and what else was crossed is found again, so a hardening that was stopped is
-begun again and does what is left.
+Every step is a run of its own under the directory of the hardening: search-0, tune-1, search-1 and so on. One that was
+stopped is begun again and does what is left.
 """
 
 import json
@@ -59,9 +58,8 @@ def harden(
     validation terrains speak for it; else the next round goes on with the controller before. Every controller is
     evaluated on hand-crafted and hard-random terrains and on elites of every archive that no training draws.
 
-    What ``run_dir`` has done already is not done again. ``certifiers`` are controllers by name that judge the searches;
-    those of :func:`qd.faults.judge.judge` if None. Returns the content of ``rounds.json``, which is written after each
-    round: the counts of all searches, which trainings were kept and why, and the tables of all controllers.
+    ``certifiers`` are controllers by name that judge the searches; those of :func:`qd.faults.judge.judge` if None.
+    Returns the content of ``rounds.json``: the counts of all searches, which trainings were kept and why, and tables.
     """
     hardening = _Hardening(robot, cfg, run_dir, compute, certifiers)
     content = hardening.content

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from kernels.episode import Outcome
+from kernels.episode import Kind, Outcome
 from kernels.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
 from qd.evaluate.sets import TerrainSet, draw_seeds, set_rng
@@ -22,17 +22,19 @@ from qd.evaluate.tables import show_table
 from qd.search.directory import RUNS
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.compute import Compute, check_policy
+from sim.controllers.described import observed_terms
 from sim.controllers.spec import describe_controllers
 from sim.files.command import publish
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import format_value, resamples, wilson_interval
 from sim.rates import counted_episodes
+from sim.robots.find import read_stray
 from sim.robots.robot import RobotCfg, robot_identity
 from sim.rollout import RolloutResult
 from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.elements.kinds import ELEMENTS
 from sim.terrains.quantities import Quantity, Sweep
-from sim.terrains.spaces.registry import load_space
+from sim.terrains.spaces.registry import check_observed, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import ground_genes
 from sim.terrains.terrains import Terrains
@@ -89,9 +91,8 @@ class Dose(Sweep):
     def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """Terrains of all values, ``count`` each: first one of each value, then the next of each.
 
-        An obstacle begins at ``count`` nodes that are spread evenly over 1 m. A cross slope leans to a side that is
-        drawn for each node, rubble is another one at each. All else is the same for all values. Returns heights [m],
-        shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
+        An obstacle begins at ``count`` nodes that are spread evenly over 1 m; all else is the same for all values.
+        Returns heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
         """
         return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
 
@@ -177,11 +178,14 @@ def measure_dose(
     """Lets every controller cross every value of every dose; prints, writes and draws the rates.
 
     Without ``terrains`` (a value) and ``episodes`` (a terrain) there are as many as suit the device. Without ``out``
-    the file lies under runs/. The figure is beside it. The report has a row for each value and controller under
-    ``dose`` (:func:`measure_rates`) and one for each dose and controller under ``half`` (:func:`find_half`).
+    the file lies under runs/. The report has ``dose`` (:func:`measure_rates`) and ``half`` (:func:`find_half`).
     """
     count, episodes = fill_sizes(compute, terrains, episodes, full=_FULL, small=_SMALL)
+    conditions = [name for name in doses if name in CONDITIONS]
+    if any(CONDITIONS[name].asks == Kind.ROUTE for name in conditions):
+        read_stray(robot)  # or refuses
     for policy in controllers.values():
+        check_observed(conditions, robot, observed_terms(policy))
         check_policy(policy, robot, compute.device)
     out = out or RUNS / f"{robot.name}-dose" / ("dose-resolved.json" if resolved else "dose.json")
 
@@ -248,7 +252,7 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
 
 
 def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult) -> dict[str, Any]:
-    """Where under half of the robots begin to reach the goal, by straight lines between the values.
+    """Where robots begin to pass less than half of the time, by straight lines between the values.
 
     The ``interval`` is 95 % of a bootstrap over the terrains of a value, from the smallest to the largest. None is
     beyond the values: ``beyond`` the ``first`` or the ``last``, or where all episodes of a value are ``invalid``.
@@ -287,7 +291,7 @@ def _find_crossing(rates: NDArray[np.floating]) -> float:
 
 
 def show_dose(report: dict[str, Any]) -> None:
-    """Prints the goal rates of every element by value and controller, and where under half reach the goal."""
+    """Prints the goal rates of every element by value and controller, and where under half of the robots pass."""
     for element, title in report["titles"].items():
         rows = [row for row in report["dose"] if row["element"] == element]
         lines = []
@@ -298,8 +302,8 @@ def show_dose(report: dict[str, Any]) -> None:
             lines.append((half["controller"], *(format_value(rate, None, ".0%") for rate in rates), passed))
         values = [f"{row['value']:g}" for row in rows if row["controller"] == rows[0]["controller"]]
         unit = f" [{rows[0]['unit']}]" if rows[0]["unit"] else ""
-        head = (f"{rows[0]['parameter']}{unit}", *values, "half of the robots reach the goal")
-        show_table(f"{title}: robots that reach the goal", head, lines)
+        head = (f"{rows[0]['parameter']}{unit}", *values, "half of the robots pass")
+        show_table(f"{title}: robots that pass", head, lines)
 
 
 def draw_dose(report: Mapping[str, Any]) -> Figure:
@@ -309,7 +313,7 @@ def draw_dose(report: Mapping[str, Any]) -> Figure:
     rows = -(-len(elements) // columns)
     figure = new_figure(max(6.0, 3.3 * columns), 1.0 + 2.5 * rows)
     contact = "contact resolved" if report["resolved"] else "at the search's settings"
-    figure.suptitle(f"{report['robot']}: robots that reach the goal, {contact}, with 95 % intervals")
+    figure.suptitle(f"{report['robot']}: robots that pass, {contact}, with 95 % intervals")
     panels = [figure.add_subplot(rows, columns, number) for number in range(1, 1 + len(elements))]
     for axes, element in zip(panels, elements, strict=True):
         element_rows = [row for row in report["dose"] if row["element"] == element]
@@ -331,7 +335,7 @@ def draw_dose(report: Mapping[str, Any]) -> Figure:
         if first["value"] > last["value"]:
             axes.invert_xaxis()
     for axes in panels[::columns]:
-        axes.set_ylabel("reach the goal [%]", fontsize=8)
+        axes.set_ylabel("pass [%]", fontsize=8)
     handles = panels[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=len(report["controllers"]), frameon=False)
     return figure

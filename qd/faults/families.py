@@ -20,6 +20,7 @@ from qd.faults.numbers import TEMPLATES, MinimalTerrains, count_faults, fault_nu
 from qd.search.archive import Archive
 from qd.search.fitness import FAILING_GOAL_RATE, Evaluation
 from sim.crossing import CrossingCfg
+from sim.rates import SUCCESS, way_to_end
 from sim.terrains.bank import make_heights
 from sim.terrains.conditions.kinds import condition_genes
 from sim.terrains.conditions.likely import Disturbance, find_log_likelihood
@@ -43,7 +44,7 @@ ORDERS = {
     "cause": "faults first, one a cause",
     "fault": "faults first",
     "likely": "faults first, the most likely conditions first",
-    "goal_rate": "goal rate, the lowest first",
+    "goal_rate": "passed, the least first",
     "collision_rate": "base collision, the most first",
     "fallen_rate": "fallen, the most first",
     "fitness": "fitness, the highest first",
@@ -56,24 +57,6 @@ def find_verdicts(archive: Archive) -> NDArray[np.int64]:
     """The verdict on each elite as its index in :data:`VERDICTS`, shape (N,)."""
     conditions = [archive.is_fault, archive.confirmed, archive.certified, archive.failing]
     return np.select(conditions, [4, 3, 2, 1], 0).astype(np.int64)
-
-
-DONE = {Kind.CROSS: "crossed", Kind.ROUTE: "followed", Kind.STAND: "stood"}
-"""What robots have done that did what they were asked for."""
-_WAYS = {
-    Outcome.GOAL: "crosses it",
-    Outcome.BASE_COLLISION: "hits the ground",
-    Outcome.TIME_OUT: "gets stuck",
-    Outcome.OUT: "leaves the terrain",
-    Outcome.TILT: "topples",
-    Outcome.STRAYED: "strays",
-    Outcome.INVALID: "breaks the simulation",
-}
-
-
-def way_to_end(outcome: int, fallen: bool) -> str:
-    """How an episode ended, as one says of a robot: ``topples`` of one that fell and did not arrive."""
-    return "topples" if fallen and outcome not in (Outcome.GOAL, Outcome.INVALID) else _WAYS[Outcome(outcome)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,13 +89,8 @@ class Ranking(Evaluation):
 
     @property
     def failing(self) -> NDArray[np.bool_]:
-        """Whether under half of the robots reach the goal, shape (N,)."""
+        """Whether under half of the episodes succeed, shape (N,)."""
         return self.goal_rate < FAILING_GOAL_RATE
-
-    @property
-    def other_rate(self) -> NDArray[np.float64]:
-        """Share that neither arrived nor collided: out of time or off the terrain, shape (N,)."""
-        return np.clip(1.0 - self.goal_rate - self.collision_rate, 0.0, 1.0)
 
     def find_row(self, number: int) -> int:
         """Row of an elite by its number in the archive."""
@@ -123,23 +101,23 @@ class Ranking(Evaluation):
         return round(float(getattr(self, rate)[row]) * int(self.counted[row]))
 
     def ending(self, row: int) -> tuple[str, str]:
-        """How most robots that fail an elite end, and the name of the rate that counts them."""
-        collided = float(self.collision_rate[row])
-        end = self.end_position[row]
-        if collided >= self.other_rate[row]:
-            fallen = 2 * self.fallen_rate[row] > collided
-            return way_to_end(Outcome.BASE_COLLISION, fallen), "fallen_rate" if fallen else "collision_rate"
+        """How most robots that fail an elite end, or that it is passed, and the name of the rate that counts them."""
+        if not self.failing[row]:
+            return SUCCESS[self.asks], "goal_rate"
+        end, collided = self.end_position[row], float(self.collision_rate[row])
         is_out = (end <= CrossingCfg.lower).any() or (end >= CrossingCfg.upper).any()
         outcome = Outcome.STRAYED if self.asks != Kind.CROSS else Outcome.OUT if is_out else Outcome.TIME_OUT
-        fallen = 2 * self.fallen_rate[row] > 1.0
-        return way_to_end(outcome, fallen), "fallen_rate" if fallen else "other_rate"
+        rate, share = "other_rate", 1.0
+        if collided >= self.other_rate[row]:
+            outcome, rate, share = Outcome.BASE_COLLISION, "collision_rate", collided
+        fallen = bool(2 * self.fallen_rate[row] > share)
+        return way_to_end(outcome, self.asks, fallen=fallen), "fallen_rate" if fallen else rate
 
     def name(self, row: int) -> str:
-        """An elite by its cause and ending: ``ridge: gets stuck, 19 of 20``; ``crossed, 18 of 20`` of others."""
-        if not self.failing[row]:
-            return f"{DONE[self.asks]}, {self.hits('goal_rate', row)} of {self.counted[row]}"
+        """An elite by its cause and ending: ``ridge: gets stuck, 19 of 20``; others ``reaches the goal, 18 of 20``."""
         ending, rate = self.ending(row)
-        return f"{self.causes[row]}: {ending}, {self.hits(rate, row)} of {self.counted[row]}"
+        cause = f"{self.causes[row]}: " if self.failing[row] else ""
+        return f"{cause}{ending}, {self.hits(rate, row)} of {self.counted[row]}"
 
     def by_cause(self) -> dict[str, NDArray[np.int64]]:
         """Rows of the failing elites by cause, the worst first; the commonest cause first, the unclear last."""
@@ -163,8 +141,7 @@ class Ranking(Evaluation):
         if by == "fault":
             return severity
         if by == "likely":
-            if self.log_likelihood is None:
-                raise ValueError("order likely needs the distribution of each condition, got none: see --likely")
+            assert self.log_likelihood is not None  # see orders
             return severity[np.lexsort((-self.log_likelihood[severity], -self.verdict[severity]))]
         if by != "cause":
             values = self.families if by == "family" else np.asarray(getattr(self, by))
@@ -199,8 +176,8 @@ def rank(
     """The ranking of an archive that has elites.
 
     Minimal terrains say best what the cause is. ``half_width`` is that of the robot's stance [m]. ``judged`` leaves out
-    elites whose fresh episodes are invalid; ``numbers`` are elites to rank alone, one a row. ``likely`` says
-    how conditions are distributed.
+    elites with invalid fresh episodes; ``numbers`` are elites to rank alone. ``likely`` says how conditions are
+    distributed.
     """
     values, is_fresh = best_values(archive)
     chosen = np.arange(len(archive)) if numbers is None else np.array(numbers, np.int64)
@@ -221,7 +198,7 @@ def rank(
         causes=tuple(cause and minimal_causes.get(number, cause) for number, cause in known),
         families=families,
         asks=space.asks,
-        log_likelihood=None if likely is None else find_log_likelihood(space.condition_rows(archive.genes), likely),
+        log_likelihood=find_log_likelihood(space.condition_rows(archive.genes), likely) if likely else None,
     )
     worst_first = dict.fromkeys(families[ranking.by_severity()].tolist())
     by_worst = {family: number for number, family in enumerate(worst_first, 1)}
@@ -278,7 +255,7 @@ def judged_numbers(
     known = {"failing": numbers["failing"] is not None, "faults": numbers["faults_panel"] is not None}
     for name, some in (("failing", distances), ("faults", distances[faults][:, faults])):
         numbers[f"{name}_distinct"] = int(pick_distinct(some).sum()) if known[name] else None
-    if likely is not None:
+    if likely:
         values = find_log_likelihood(space.condition_rows(archive.genes), likely)
         chosen = {"failing": archive.failing, "faults": archive.is_fault}
         numbers["likeliest"] = {name: _find_likeliest(values, some) for name, some in chosen.items()}

@@ -1,8 +1,7 @@
 """Judging: which elites of a search are faults of its controller, stage by stage.
 
-Elites that fail by fresh episodes are crossed with contact resolved and by other controllers: :mod:`qd.faults.numbers`
-says what follows. Episodes follow from the run's seed and from what names an elite. Crossings are kept in the run, so
-that a judging that was stopped finds them when it is run again.
+Episodes follow from the run's seed and from what names an elite. Crossings are kept in the run, so that a judging that
+was stopped finds them when it is run again.
 """
 
 from abc import ABC, abstractmethod
@@ -42,7 +41,6 @@ from sim.controllers.spec import controller_hash, controller_identity
 from sim.files.atomic import read_json, to_json, write_atomically
 from sim.mujoco_c.model import NO_SOFTNESS
 from sim.rollout import RolloutResult
-from sim.terrains.conditions.likely import Disturbance, choose_likely
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import at_height
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
@@ -64,8 +62,6 @@ class Judging:
     """Terrains for which the stage ``steered`` looks for witnesses at most."""
     step: str = ""
     """What bars say before their label."""
-    likely: Mapping[str, Disturbance] | None = None
-    """How conditions are distributed, if that is known."""
 
     @property
     def origin(self) -> dict[str, Any]:
@@ -443,21 +439,17 @@ def judge(
     policy: str | None = None,
     space: str | None = None,
     most_steered: int | None = None,
-    likely: Path | None = None,
 ) -> Archive:
     """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
     ``stages`` are some of :data:`STAGES`, ``certifiers`` other controllers by name, those of :func:`find_certifiers` if
-    None; robot, policy and space are as :func:`qd.faults.searches.find_search` takes them, ``likely`` is the file of
-    :func:`sim.terrains.conditions.likely.choose_likely`.
+    None; robot, policy and space are as :func:`qd.faults.searches.find_search` takes them.
     """
     if unknown := [name for name in stages if name not in STAGES]:
         raise ValueError(f"stages must be some of {', '.join(STAGES)}, got {', '.join(unknown)}")
     ask = any(STAGES[name].asks_certifiers for name in stages)
     search = find_search(run, robot=robot, policy=policy, space=space)
-    disturbances = (None if likely else search.cfg.fitness.disturbances) or choose_likely(search.space, likely)
     with open_judging(search, compute, certifiers, ask=ask) as judging:
-        judging = replace(judging, likely=disturbances)
         archive = search.read_archive()
         for index, name in enumerate(stages):
             STAGES[name].check(archive, judging, stages[:index])
@@ -477,7 +469,9 @@ def _write(archive: Archive, judging: Judging, stage: str) -> None:
     metrics = run.read_metrics() if (run.path / METRICS_FILE).exists() else []
     if len(metrics) >= archive.iterations:  # a search that was stopped has not written its numbers
         numbers |= found_numbers(archive, metrics[: archive.iterations])
-    numbers |= fresh_numbers(archive, archive.fresh) | judged_numbers(archive, judging.search.space, judging.likely)
+    search = judging.search
+    numbers |= fresh_numbers(archive, archive.fresh)
+    numbers |= judged_numbers(archive, search.space, search.cfg.fitness.disturbances)
     numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin}
     write_archive(run.path, archive)
     write_atomically(file, to_json(numbers))

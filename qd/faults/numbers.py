@@ -1,9 +1,6 @@
 """Faults in numbers and words: what is known of the elites on which a controller fails, and their minimal terrains.
 
-An elite fails by its 40 fresh episodes. It is confirmed if it fails with contact resolved too, and certified if another
-controller crosses it, at the search's settings and with contact resolved. A fault is both. A terrain without a
-certificate is not known to be passable. A fault is robust if it is one under varied conditions too
-(:func:`sim.terrains.spaces.wider.varied_genes`), and it holds in MuJoCo C if it is one there, too.
+docs/faults.md says what the words mean.
 """
 
 from collections.abc import Container, Mapping, Sequence
@@ -23,6 +20,7 @@ from sim.files.atomic import read_json
 from sim.files.intervals import RATES, bootstrap_interval, format_rate, format_value, wilson_interval
 from sim.files.npz import read_arrays
 from sim.files.templates import open_templates
+from sim.rates import SUCCESS
 
 FRESH_EPISODES = 40
 """Episodes that each elite is evaluated again with."""
@@ -220,8 +218,8 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
     witness = describe_witness(archive, number)
     if not rates and not witness:
         return []
-    known: dict[str, Any] = {"rates": rates, "witness": witness}
-    known["crossers"] = [*compress(archive.certifiers, archive.certificates[number].tolist())]
+    known: dict[str, Any] = {"rates": rates, "witness": witness, "success": SUCCESS[archive.terrain_space.asks]}
+    known["passers"] = [*compress(archive.certifiers, archive.certificates[number].tolist())]
     known |= {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
     known["in_mujoco_c"] = archive.mujoco_c is not None and archive.mujoco_c.searched[number].any()
     known["on_line"] = archive.witnesses is not None and archive.witnesses.on_line[number]

@@ -43,7 +43,7 @@ class FitnessCfg:
     likely: NonNegativeFloat = 0.0
     """How much less what is unlikely is worth in the search: the power of the likelihood that it is multiplied by."""
     disturbances: dict[str, Disturbance] = field(default_factory=dict)
-    """How conditions are distributed, by their names; empty where ``likely`` is 0."""
+    """How the conditions of the space are distributed, by their names; empty where it is not known."""
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -88,7 +88,7 @@ class Evaluation(ColumnTable):
     collision_rate: NDArray[np.float64]
     """Share of episodes with a base collision."""
     goal_rate: NDArray[np.float64]
-    """Share of episodes that reached the goal."""
+    """Share of episodes that succeeded."""
     fallen_rate: NDArray[np.float64]
     """Share of episodes that ended tilted by more than 60 degrees."""
     end_position: NDArray[np.float32]
@@ -102,6 +102,11 @@ class Evaluation(ColumnTable):
     def counted(self) -> NDArray[np.int64]:
         """Valid episodes, shape (T,)."""
         return self.episodes - self.invalid_episodes
+
+    @property
+    def other_rate(self) -> NDArray[np.float64]:
+        """Share that neither succeeded nor collided, shape (T,)."""
+        return np.clip(1.0 - self.goal_rate - self.collision_rate, 0.0, 1.0)
 
     @property
     def spread(self) -> NDArray[np.float64]:

@@ -52,11 +52,12 @@ def start_search(
     height: float | None,
     compute: Compute,
     skip_level_ground: bool = False,
+    likely: Path | None = None,
 ) -> tuple[SearchCfg, RobotCfg]:
     """Settings of a new search by the name of a preset, and its robot, which is checked and has penalty scales then.
 
-    Robot, controller and space are as flags take them. ``height`` is the largest one of a bump [m]; None is that which
-    fits the robot. A user's robot must cross level ground, unless ``skip_level_ground``.
+    Robot, controller, space and the file ``likely`` are as flags take them. ``height`` is the largest one of a bump
+    [m]; None is that which fits the robot. A user's robot must cross level ground, unless ``skip_level_ground``.
     """
     terrain_space = load_space(space)
     if height is not None:
@@ -67,7 +68,8 @@ def start_search(
     terrain_space = space_at(terrain_space, height, ready)
     if terrain_space.asks == Kind.ROUTE:
         ensure_stray(ready, policy, compute)
-    return preset(size, ready, policy, space=terrain_space.name, space_sha256=terrain_space.sha256), ready
+    named: Any = {"space": terrain_space.name, "space_sha256": terrain_space.sha256, "likely": likely}
+    return preset(size, ready, policy, **named), ready
 
 
 def search(
@@ -83,8 +85,8 @@ def search(
 
     It ends earlier once its last tenth brought a share of the elites below ``until``
     (:func:`qd.search.results.compute_last_tenth`), crosses what it asked for, and settles. Nothing is written before
-    the simulation is built; all finished iterations are saved. ``robot`` is given if it is not shipped, ``policy`` if
-    the controller lies elsewhere than ``cfg`` says. The archive is a judged one if nothing was left to do after it.
+    the simulation is built. ``robot`` is given if it is not shipped, ``policy`` if the controller lies elsewhere than
+    ``cfg`` says. The archive is a judged one if nothing was left to do after it.
     """
     robot = robot or get_robot(cfg.robot)
     if unknown := set(cfg.fitness.penalties) - set(robot.penalties):

@@ -14,6 +14,8 @@ from sim.controllers.spec import SHIPPED, ControllerSpec, controller_hash, resol
 from sim.files.settings import NonNegativeInt, PositiveInt, check_settings
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg, robot_identity
+from sim.terrains.conditions.likely import choose_likely
+from sim.terrains.spaces.registry import get_space
 
 _MAX_EPISODES = 10_000_000  # of an iteration
 
@@ -60,8 +62,13 @@ def preset(
     *,
     space: str = "super_gaussian",
     space_sha256: str | None = None,
+    likely: Path | None = None,
 ) -> SearchCfg:
-    """Settings of a search by the name of a preset; without ``policy`` of the robot's own controller."""
+    """Settings of a search by the name of a preset; without ``policy`` of the robot's own controller.
+
+    ``likely`` is the file of :func:`sim.terrains.conditions.likely.choose_likely`.
+    """
+    known = choose_likely(get_space(space, space_sha256), likely)
     return SearchCfg(
         robot=robot.name,
         **robot_identity(robot),
@@ -71,7 +78,7 @@ def preset(
         space=space,
         space_sha256=space_sha256,
         collision_bit=robot.collision_bit,
-        fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy)),
+        fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy), disturbances=known),
         **read_preset(name),
     )
 

@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta
-from tyro.conf import Suppress
 
 from sim.controllers.spec import parse_controllers
 from sim.files.command import (
     ControllerFlags,
     DeviceFlag,
     EliteFlags,
-    LikelyFlag,
     RobotFlag,
     SpaceFlag,
     WorkerFlags,
@@ -23,20 +21,11 @@ from sim.robots.find import get_robot
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags, LikelyFlag):
+class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
     """Cross terrains again: how often robots get over, what it costs them, and a figure with their paths.
 
-    Terrains are elites of a run, or minimal terrains, or a height map of your own. Elites are numbered by falling
-    fitness; after fresh episodes their corrected fitness counts. That is not the order in which the controller fails:
-    `faultline view` and `faultline report` list faults first.
-
-    A map is a grid of heights over a rectangle: an .npz with an array `heights` (rows along y, columns along x, in
-    metres), or a grayscale .png of 8 or 16 bits seen from above (x to the right, y up) with the metres of a gray level.
-    Its size in metres is given here, or as `size_m` in the .npz, or with `scale_m` and `offset_m` in a .json of the
-    same name beside the .png, such as `faultline export` writes. Robots start near x = 2 m, y = 4 m and walk to
-    x = 14 m, y = 4 m. The middle of the map lies on the middle of what they cross, 16 m x 8 m. The rest of a larger map
-    is cut off. A smaller one goes on at the height of its edge. The map is resampled to 0.05 m: linearly, or by
-    weighted means where it is finer.
+    Terrains are elites of a run, numbered by falling (corrected) fitness, or minimal terrains, or a height map of your
+    own. `faultline view` and `faultline report` list faults first.
     """
 
     terrain: Path | None = None
@@ -69,10 +58,10 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags, LikelyFlag):
 
         crossing: Any = {"policy": self.policy, "replicas": self.replicas, "seed": self.seed}
         if self.terrain is None:
-            opened_run = open_run(self.robot, self.run, space=self.space, likely=self.likely)
+            opened_run = open_run(self.robot, self.run, space=self.space)
             return source_from_run(opened_run, self.elite, self.minimal, **crossing)
-        if self.run is not None or self.likely is not None:
-            raise ValueError("--run and --likely are about elites: leave them out, or --terrain")
+        if self.run is not None:
+            raise ValueError("--run is about elites: leave it out, or --terrain")
         crossing |= {"size_m": self.size, "scale_m": self.scale, "offset_m": self.offset}
         return source_from_map(self.terrain, get_robot(self.robot or "anymal"), **crossing)
 
@@ -81,10 +70,9 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags, LikelyFlag):
 class FilmCommand(ReplayCommand):
     """Film how a robot fails, on elites of a run or on a terrain of your own.
 
-    The terrains and the episodes are those that `faultline replay` shows. The film begins 3 s before the robot falls,
-    collides or gets stuck, shows the last second before that four times slower, and ends 1 s after it. Feet that touch
-    are yellow, base and legs that touch magenta. Arrows are contact forces of the feet, red beyond the robot's limit.
-    The map shows all paths.
+    The terrains and the episodes are those that `faultline replay` shows. The film begins 3 s before the robot fails,
+    shows the last second before that four times slower, and ends 1 s after it. Touching feet are yellow, base and legs
+    magenta. Arrows are contact forces of the feet, red beyond the robot's limit.
     """
 
     episode: NonNegativeInt | None = None
@@ -98,8 +86,6 @@ class FilmCommand(ReplayCommand):
     as --policy takes it; or witness, the one that crosses the elite where it is steered (`faultline judge`)."""
     shadows: bool = True
     """Whether the sun casts shadows; without a GPU they take half of the time."""
-    likely: Suppress[Path | None] = None
-    """Films have no numbers."""
 
     def execute(self) -> None:
         """Makes the films."""
@@ -129,18 +115,12 @@ class PackFlags(WorkerFlags):
 class ExportCommand(ControllerFlags, EliteFlags):
     """Write terrains as files that other programs read, a pack of terrains, or a controller as ONNX.
 
-    For each elite it writes `elite-N.xml` (MJCF: the terrain with start and goal, whose surface is the simulation's
-    between the nodes too), `elite-N.stl` (a closed block), `elite-N.glb` (the same with heights as colours),
-    `elite-N.sdf` (a model of the STL for Gazebo), `elite-N.npy` (heights as int16 in mm, x along the rows, as the
-    terrain generators of Isaac Lab and legged_gym take them), `elite-N.png` (16-bit grayscale seen from above) and
-    `elite-N.npz` (heights in m, rows along y; genes; friction and softness where the ground has them). `elite-N.json`
-    has scales, start, goal, verdict, cause and ending, README.md says how MuJoCo, mjlab, Isaac Lab and Gazebo take the
-    files. `faultline replay --terrain elite-N.npz`, or with the .png, crosses it again.
+    For each elite it writes `elite-N` in some formats (docs/reference.md), `elite-N.json` with scales, start, goal,
+    verdict, cause and ending, and a README.md that says how MuJoCo, mjlab, Isaac Lab and Gazebo take them. `faultline
+    replay --terrain elite-N.npz`, or with the .png, crosses it again.
 
-    With --pack it makes a pack from a judged run: faults and near-faults, to test any controller on with `faultline
-    evaluate --pack`. The terrains are spread over the ways in which the searched controller fails and over families of
-    kin. Every controller crosses each terrain. pack.npz has the terrains, pack.json the rates and what is known of each
-    terrain.
+    With --pack it makes a pack from a judged run: faults and near-faults, spread over the ways in which the searched
+    controller fails and over families of kin, to test any controller on with `faultline evaluate --pack`.
     """
 
     from_pack: str | None = None
@@ -196,12 +176,12 @@ class ExportCommand(ControllerFlags, EliteFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportCommand(ControllerFlags, DeviceFlag, LikelyFlag, SpaceFlag):
+class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
     """Write one HTML page about a run; it opens from disk, without a network, and prints well.
 
-    It begins with what stops the robot, and shows the worst terrains close up at the moment of failure, with another
-    controller beside that crosses them. For this robots cross these terrains again, 20 times each. The crossings are
-    stored, so the same command goes on after a stop.
+    It begins with what the robot fails, and shows the worst terrains close up at the moment of failure, with another
+    controller beside that passes them. For this robots try these terrains again, 20 times each, which is stored: the
+    same command goes on after a stop.
     """
 
     run: Path | None = None
@@ -220,23 +200,16 @@ class ReportCommand(ControllerFlags, DeviceFlag, LikelyFlag, SpaceFlag):
         from qd.show.report.report import write_report
 
         named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space, "device": self.device}
-        named["likely"] = self.likely
         write_report(self.run, out=self.out, num_elites=self.elites, tables=self.tables, **named)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewCommand(RobotFlag, EliteFlags, LikelyFlag):
+class ViewCommand(RobotFlag, EliteFlags):
     """Look at an archive in the browser: its elites, their terrains in 3-D, and the robot that crosses them.
 
-    It opens on the worst terrain of the commonest cause, of causes that have a fault if any has, one second before the
-    robot fails, and plays; the controller that crosses the terrain is shown beside it as a ghost. Under the scene are
-    play, the time with marks where things happen, episode, speed and follow. On the left are the elites, by what stops
-    the robot, as a list and on a map of where episodes end; a click shows one. On the right stand how often the robot
-    arrives, who crosses beside it, its penalties, and a button that films what is shown. Crossings that are not
+    It opens on the worst terrain of the commonest cause one second before the robot fails, and plays, with the
+    controller that passes it as a ghost beside; docs/reference.md has the page and its keys. Crossings that are not
     recorded yet run on the CPU, which takes seconds, and are stored under --cache.
-
-    Browser tabs do not affect each other. The address of a tab holds what it shows: ?elite=12&controller=C-G&t=8.4
-    opens just that.
 
     Ctrl-C ends it. No GPU and no screen are needed: over ssh, forward the port (ssh -L 8080:localhost:8080 HOST) and
     open the page at home.
@@ -246,6 +219,8 @@ class ViewCommand(RobotFlag, EliteFlags, LikelyFlag):
     """Controllers to choose from, each NAME=FILE, NAME=module:callable or NAME=shipped, such as base=shipped
     C-G=runs/tuned/policy.pt; if none is given, the one the archive was made with, and those of the robot's panel that
     certify its faults."""
+    likely: Path | None = None
+    """File that says how conditions are distributed, in place of what the run remembers (`faultline archive`)."""
     port: int = 8080
     """Where the page is served."""
     host: str = "127.0.0.1"

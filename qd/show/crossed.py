@@ -11,14 +11,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from kernels.episode import FALLEN_GRAVITY_Z, Outcome
-from qd.faults.families import way_to_end
+from kernels.episode import FALLEN_GRAVITY_Z, Kind, Outcome
 from sim.files.figures import new_figure
 from sim.files.intervals import format_rate, wilson_interval
-from sim.rates import typical_outcome
+from sim.rates import typical_outcome, way_to_end
 from sim.recording.recorder import Recording
 from sim.robots.robot import ROBOTS
-from sim.terrains.maps.picture import GOAL, LENGTH, SLIPPERY, SOFT, START, draw_heights
+from sim.terrains.maps.picture import LENGTH, MARKS, SLIPPERY, SOFT, draw_heights, places
+from sim.terrains.terrains import asked_of
 
 
 class Ending(NamedTuple):
@@ -28,27 +28,29 @@ class Ending(NamedTuple):
     color: str = "#5a5a5a"
     """As ``#rrggbb`` (Okabe and Ito's)."""
     marker: str = ""
-    """Matplotlib's, where the episode ended."""
     line: str = ""
-    """Matplotlib's, of the path to it."""
+    """Matplotlib's, of the path."""
 
 
-ENDINGS = {
-    Outcome.GOAL: Ending("reached the goal", "#009e73", "o", "-"),
-    Outcome.BASE_COLLISION: Ending("base collision", "#d55e00", "X", "--"),
-    Outcome.TIME_OUT: Ending("out of time", "#0072b2", "s", "-."),
-    Outcome.OUT: Ending("left the terrain", "#cc79a7", "^", ":"),
-    Outcome.TILT: Ending("fell", "#e69f00", "v", "--"),
-    Outcome.STRAYED: Ending("strayed from its command", "#f0e442", "D", ":"),
+_LOOKS = {
+    Outcome.GOAL: ("#009e73", "o", "-"),
+    Outcome.BASE_COLLISION: ("#d55e00", "X", "--"),
+    Outcome.TIME_OUT: ("#0072b2", "s", "-."),
+    Outcome.OUT: ("#cc79a7", "^", ":"),
+    Outcome.TILT: ("#e69f00", "v", "--"),
+    Outcome.STRAYED: ("#f0e442", "D", ":"),
 }
-"""How a valid episode may end, the good way first."""
-ARRIVED, *FAILED = (ending.label for ending in ENDINGS.values())
-"""Labels of the good way, and of the others."""
 
 
-def get_ending(outcome: int) -> Ending:
-    """How an episode of an outcome ended, a valid one or not."""
-    return ENDINGS.get(Outcome(outcome), Ending("invalid: the simulation broke"))
+def all_endings(asks: Kind) -> dict[Outcome, Ending]:
+    """How a valid episode of robots that are asked for something may end, the good way first."""
+    return {outcome: Ending(way_to_end(outcome, asks), *look) for outcome, look in _LOOKS.items()}
+
+
+def get_ending(recording: Recording, episode: int) -> Ending:
+    """How an episode of one terrain ended, a valid one or not."""
+    outcome = Outcome(recording.outcome[0, episode])
+    return Ending(way_to_end(outcome, asked_of(recording.ground)), *_LOOKS.get(outcome, ()))
 
 
 class Rate(NamedTuple):
@@ -67,12 +69,13 @@ class Rate(NamedTuple):
 
 
 def count_rates(recording: Recording) -> dict[str, Rate]:
-    """How often valid episodes of one terrain ended in each way, by the labels of :data:`ENDINGS`, and ``fallen``."""
+    """How valid episodes of one terrain ended, by names of rates as a :class:`qd.faults.families.Ranking` has them."""
     outcome = recording.outcome[0]
     valid = outcome != Outcome.INVALID
-    hits = {ending.label: outcome == end for end, ending in ENDINGS.items()}
-    hits["fallen"] = recording.fallen[0] & valid
-    return {label: Rate(int(hit.sum()), int(valid.sum())) for label, hit in hits.items()}
+    goal, collided = outcome == Outcome.GOAL, outcome == Outcome.BASE_COLLISION
+    hits = {"goal_rate": goal, "collision_rate": collided, "other_rate": valid & ~goal & ~collided}
+    hits["fallen_rate"] = recording.fallen[0] & valid
+    return {name: Rate(int(hit.sum()), int(valid.sum())) for name, hit in hits.items()}
 
 
 _STUCK = 0.3  # a robot is stuck once it is so near to where it ends [m]
@@ -156,7 +159,7 @@ def make_title(recording: Recording, controller: str = "") -> str:
     fallen = recording.fallen[0]
     falls = typical != Outcome.GOAL and fallen[hits].mean() > 0.5
     count = (fallen & valid if falls else hits).sum()
-    return f"{head}: {way_to_end(typical, falls)}, {count} of {valid.sum()}"
+    return f"{head}: {way_to_end(typical, asked_of(recording.ground), fallen=falls)}, {count} of {valid.sum()}"
 
 
 def draw_crossing(recording: Recording, title: str) -> Figure:
@@ -167,7 +170,7 @@ def draw_crossing(recording: Recording, title: str) -> Figure:
     ground = recording.ground
     image = draw_heights(top, recording.heights[0], ground)
     figure.colorbar(image, ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
-    handles = [*_draw_paths(top, recording), *(Line2D([], [], **look) for look in (START, GOAL))]
+    handles = [*_draw_paths(top, recording), *(Line2D([], [], **MARKS[name]) for name in places(asked_of(ground)))]
     if ground is not None:
         patches = {"slippery": (SLIPPERY, ground.friction < 1.0), "soft": (SOFT, ground.time_constant_s > 0.0)}
         handles += [Patch(color=color, alpha=0.5, label=label) for label, (color, at) in patches.items() if at.any()]
@@ -186,7 +189,7 @@ def _draw_paths(axes: Axes, recording: Recording) -> list[Any]:
     """Draws every path and how it ended; returns a handle with a count for each ending."""
     handles: list[Any] = []
     xs = [0.0, LENGTH]
-    for outcome, ending in ENDINGS.items():
+    for outcome, ending in all_endings(asked_of(recording.ground)).items():
         paths = [recording.qpos(0, k)[:, :2] for k in np.flatnonzero(recording.outcome[0] == outcome).tolist()]
         if not paths:
             continue
@@ -197,6 +200,6 @@ def _draw_paths(axes: Axes, recording: Recording) -> list[Any]:
         axes.scatter(*ends, s=55, edgecolors="white", zorder=3, **mark)
         mark |= {"linestyle": ending.line, "markeredgecolor": "white", "markersize": 9}
         handles.append(Line2D([], [], **mark, label=f"{ending.label} ({len(paths)})"))
-        xs += ends[0].tolist()
+        xs += np.concatenate(paths)[:, 0].tolist()
     axes.set_xlim(min(xs), max(xs))  # robots may leave the terrain
     return handles

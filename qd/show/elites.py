@@ -1,7 +1,7 @@
 """The archive of a run, its terrains, and the controller that was searched."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,8 +56,8 @@ class OpenedRun:
     robot: RobotCfg
     minima: MinimalTerrains | None = None
     """The minimal terrains of its elites, if there are some."""
-    likely: Mapping[str, Disturbance] | None = None
-    """How conditions are distributed, if that is known."""
+    likely: Mapping[str, Disturbance] = field(default_factory=dict)
+    """How conditions are distributed; empty where that is not known."""
 
     @property
     def folder(self) -> Path:
@@ -81,11 +81,9 @@ class OpenedRun:
 
     def log_likelihood(self, genes: NDArray[np.float32]) -> float | None:
         """Of the conditions of a terrain, (num_genes,); None where it is not known how these are distributed."""
-        return (
-            None
-            if self.likely is None
-            else float(find_log_likelihood(self.space.condition_rows(genes[None]), self.likely)[0])
-        )
+        if not self.likely:
+            return None
+        return float(find_log_likelihood(self.space.condition_rows(genes[None]), self.likely)[0])
 
     def command(self, word: str, **flags: object) -> str:
         """A command about this run as a user types it."""
@@ -171,12 +169,12 @@ def open_run(
     """The archive of a run directory or file; without one the robot's newest under runs/, else its published one.
 
     Robot and terrain space are as the command line names them; without a robot it is that of the run. ``likely`` is the
-    file of :func:`sim.terrains.conditions.likely.choose_likely`.
+    file of :func:`sim.terrains.conditions.likely.choose_likely`, in place of what the search knew.
     """
     run = find_run(get_robot(named or "anymal"), run)
     archive = read_archive(run)
     robot = resolve_robot(archive.named(), named, run)
     check_space(archive, space)
-    known: Any = {"minima": read_minimal(find_directory(run), archive)}
-    known["likely"] = choose_likely(archive.terrain_space, likely)
-    return OpenedRun(path=run, archive=archive, robot=robot, **known)
+    opened = OpenedRun(path=run, archive=archive, robot=robot, minima=read_minimal(find_directory(run), archive))
+    searched = opened.as_searched()[1].disturbances if opened.space.conditions and not likely else None
+    return replace(opened, likely=searched or choose_likely(opened.space, likely))

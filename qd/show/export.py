@@ -135,7 +135,7 @@ def _describe_elite(ranking: Ranking, row: int, archive: Archive) -> dict[str, A
         "elite": elite,
         "verdict": VERDICTS[ranking.verdict[row]] or "not failing",
         "cause": ranking.causes[row] or None,
-        "ending": ranking.ending(row)[0] if ranking.failing[row] else "crossed",
+        "ending": ranking.ending(row)[0],
         "in_words": ranking.name(row),
         "iteration": int(archive.iteration[elite]),
         **list_numbers(archive),

@@ -15,19 +15,18 @@ from numpy.typing import NDArray
 from kernels.penalties import PENALTIES
 from qd.faults.numbers import FRESH_EPISODES
 from qd.search.archive import Archive
-from sim.crossing import CrossingCfg
 from sim.files.atomic import write_atomically
 from sim.files.figures import as_png, new_figure
 from sim.files.intervals import format_value
 from sim.terrains.bank import make_terrains
-from sim.terrains.maps.picture import LENGTH, WIDTH, height_colors, tinted
+from sim.terrains.maps.picture import LENGTH, WIDTH, height_colors, places, tinted
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.terrains import GroundMaps
+from sim.terrains.terrains import GroundMaps, asked_of
 
 _BLUE = "#0072b2"
 _SUN = (-0.45, 0.35)  # light that slopes along x and y of a relief gain
 _MARK_M = 0.3  # half side of the marks of start and goal
-_MARKS = ((CrossingCfg.start, (240, 200, 60)), (CrossingCfg.goal, (0, 158, 115)))
+_COLORS = {"start": (240, 200, 60), "goal": (0, 158, 115)}
 _MAX_MINIMAL = 12
 _COLUMNS = 3
 
@@ -36,18 +35,18 @@ def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> N
     """A terrain of heights [m], shape (nrow, ncol), from above: blue below the start's level, brown above, lit.
 
     The nodes may be several cells apart; only with all of them the ground can be tinted. The start is yellow and the
-    goal green. RGB, shape (nrow, ncol, 3), row along y.
+    goal, if there is one, green. RGB, shape (nrow, ncol, 3), row along y.
     """
     spacing = LENGTH / (heights.shape[1] - 1)
     rise_y, rise_x = (np.asarray(rise) for rise in np.gradient(heights, spacing))
     light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
     colors = height_colors(heights) if ground is None else tinted(height_colors(heights), ground)
     pixels = np.clip(255.0 * colors * light[..., None], 0.0, 255.0).astype(np.uint8)
-    for (x, y), color in _MARKS:
+    for name, (x, y) in places(asked_of(ground)).items():
         row = round(y / spacing)
         column = round(x / spacing)
         half = round(_MARK_M / spacing)
-        pixels[row - half : row + half + 1, column - half : column + half + 1] = color
+        pixels[row - half : row + half + 1, column - half : column + half + 1] = _COLORS[name]
     return pixels
 
 
@@ -135,7 +134,8 @@ def draw_minimal(
     counts = dict(Counter(causes).most_common())
     heights = (1.0 + 0.25 * len(counts), 2.1 * rows)
     figure = new_figure(13.0, sum(heights))
-    figure.suptitle(f"{robot}: {len(entries):,} minimal terrains; start yellow, goal green, blue low, brown high")
+    marks = "start yellow" + ", goal green" * ("goal" in places(space.asks))
+    figure.suptitle(f"{robot}: {len(entries):,} minimal terrains; {marks}, blue low, brown high")
     subfigures: Any = figure.subfigures(2, 1, height_ratios=heights)
     axes = subfigures[0].subplots()
     axes.bar_label(axes.barh([*counts], [*counts.values()], color="#d55e00"), padding=3)
@@ -151,5 +151,5 @@ def draw_minimal(
         ground = None if grounds is None else grounds[k : k + 1]
         panel.imshow(relief(grids[k], ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH))
         title = f"elite {entry['elite']}: {causes[index]}, {len(entry['bumps'])} of {entry['of']} parts"
-        panel.set_title(f"{title}, {format_value(entry['goal_rate'], None, '.0%')} arrive", fontsize=9)
+        panel.set_title(f"{title}, {format_value(entry['goal_rate'], None, '.0%')} pass", fontsize=9)
     return figure

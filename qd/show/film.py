@@ -17,21 +17,21 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import uniform_filter1d
 
 from kernels.episode import Outcome
-from qd.faults.families import way_to_end
 from qd.faults.numbers import SPECIALIST
 from qd.faults.searches import CERTIFIERS_FOLDER, controllers_in
 from qd.search.progress import Bar
-from qd.show.crossed import ARRIVED, count_rates, find_failure_time, find_typical_episode, get_ending, make_title
+from qd.show.crossed import count_rates, find_failure_time, find_typical_episode, get_ending, make_title
 from qd.show.replay import WITNESS, ReplaySource, save
 from qd.workers.compute import check_policy
 from sim.controllers.spec import SHIPPED, label_suffix, resolve_policy
-from sim.crossing import CrossingCfg
 from sim.files.command import command_line
 from sim.mujoco_c.model import surface_heights
+from sim.rates import SUCCESS, way_to_end
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer, open_context
 from sim.robots.robot import RobotCfg
-from sim.terrains.maps.picture import LENGTH, height_colors
+from sim.terrains.maps.picture import LENGTH, height_colors, places
+from sim.terrains.terrains import asked_of
 
 FPS = 25
 """Pictures a second of a film."""
@@ -136,7 +136,6 @@ def render_pictures(
     """The pictures of a film, each at a time of the episode [s], of a size [pixels].
 
     Small ones are rendered twice as fine. A map has all paths, the shown one in the colour of how it ended.
-    ``progress`` is called with the share that is done.
     """
     recording = shot.recording
     ghost_name, ghost = shot.beside or ("", None)
@@ -150,8 +149,9 @@ def render_pictures(
     for k in sorted(range(recording.num_episodes), key=lambda k: k == shot.episode):  # the shown one on top
         path = recording.base_position[0, k, : recording.num_frames[0, k], :2]
         shown = k == shot.episode
-        draw.line(_locate(chart, path), get_ending(recording.outcome[0, k]).color if shown else "white", 1 + 2 * shown)
-    draw.circle(_locate(chart, np.array([CrossingCfg.goal]))[0], side / 60, "#009e73", "white")
+        draw.line(_locate(chart, path), get_ending(recording, k).color if shown else "white", 1 + 2 * shown)
+    if goal := places(asked_of(recording.ground)).get("goal"):
+        draw.circle(_locate(chart, np.array([goal]))[0], side / 60, "#009e73", "white")
     steps = np.diff(times, append=np.inf)
     slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
     width, height = (pixels * (1 if size[0] > GIF_SIZE[0] else _SUPERSAMPLING) for pixels in size)
@@ -186,15 +186,16 @@ def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: i
 
     write(10, 32, shot.title, 28, "black")
     if shot.beside is None:
-        write(10, 62, f"{ARRIVED}: {count_rates(shot.recording)[ARRIVED]}", 24, "#303030")
+        success = SUCCESS[asked_of(shot.recording.ground)]
+        write(10, 62, f"{success}: {count_rates(shot.recording)['goal_rate']}", 24, "#303030")
     else:
         write(10, 62, f"{shot.beside[0]} {make_title(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
     speed = f"  1/{slowness} speed" if slowness > 1 else ""
     write(picture.width / unit - 10, 528, f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
     if shot.moment is not None and time_s >= shot.moment:
-        outcome = shot.recording.outcome[0, shot.episode]
-        failure = way_to_end(outcome, bool(shot.recording.fallen[0, shot.episode]))
-        write(10, 528, f"{failure} at {shot.moment:.1f} s", 30, get_ending(outcome).color)
+        recording, row = shot.recording, (0, shot.episode)
+        failure = way_to_end(recording.outcome[row], asked_of(recording.ground), fallen=bool(recording.fallen[row]))
+        write(10, 528, f"{failure} at {shot.moment:.1f} s", 30, get_ending(shot.recording, shot.episode).color)
 
 
 def _locate(image: Image.Image, positions: NDArray[np.floating]) -> list[tuple[float, float]]:
@@ -219,8 +220,7 @@ def film(
     """Films an episode of a recording of one terrain as the MP4 or GIF that ``out`` is by its name.
 
     Without an ``episode`` it is the typical one, by the ``scales`` of penalties: the seconds around the failure, or the
-    ``whole``. ``by`` names the controller, where it is not the robot's own; ``beside`` is another with its recording
-    from the same starts. ``progress`` is called with the share that is done.
+    ``whole``. ``by`` names the controller, where it is not the robot's own; ``beside`` is as of a :class:`Shot`.
     """
     if episode is None:
         episode = find_typical_episode(recording, scales)

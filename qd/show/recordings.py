@@ -136,7 +136,7 @@ class Recordings:
             lots[requests[k].lot_key].append(k)
         text = f"{len(missing)} terrain{'s' * (len(missing) > 1)}, {requests[missing[0]].replicas} times each"
         done = 0
-        with Bar(f"crossing {text}", len(missing)) as bar:
+        with Bar(f"recording {text}", len(missing)) as bar:
             for lot in (rows[k : k + self._lot] for rows in lots.values() for k in range(0, len(rows), self._lot)):
                 crossed = self._cross([requests[k] for k in lot], bar.within(done, len(lot)))
                 for k, recording in zip(lot, crossed, strict=True):

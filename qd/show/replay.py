@@ -16,7 +16,7 @@ from qd.faults.searches import CERTIFIERS_FOLDER
 from qd.search.descriptors import Cells
 from qd.search.directory import RUNS, output_folder
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
-from qd.show.crossed import draw_crossing, make_title
+from qd.show.crossed import count_rates, draw_crossing, make_title
 from qd.show.elites import EliteTerrain, OpenedRun
 from qd.show.recordings import CrossingRequest, Recordings, request_elite
 from qd.workers.invalid import format_reasons, invalid_reasons, refuse_all_invalid
@@ -26,11 +26,12 @@ from sim.files.atomic import prepare_output, to_json, write_atomically
 from sim.files.figures import as_png
 from sim.files.intervals import format_rate, wilson_interval
 from sim.files.templates import open_templates
+from sim.rates import rate_labels
 from sim.recording.recorder import Recording
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.terrains.maps.heightmap import as_terrain, fitted, read_heightmap
-from sim.terrains.terrains import Terrains
+from sim.terrains.terrains import Terrains, asked_of
 
 _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 WITNESS = "witness"
@@ -206,11 +207,11 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
     """Rates with 95 % intervals (Wilson), outcomes and raw penalties of the valid episodes on one terrain."""
     outcome = recording.outcome[0]
     valid = outcome != Outcome.INVALID
-    count = int(valid.sum())
+    rates = count_rates(recording)
+    goal, count = rates["goal_rate"]
     counts = {end: int((outcome == end).sum()) for end in Outcome if end}
     outcomes = {end.name.lower(): count for end, count in counts.items() if count or end < Outcome.TILT}
-    fallen = int(recording.fallen[0, valid].sum())
-    hits = {"success": count - outcomes["base_collision"], "goal": outcomes["goal"], "fallen": fallen}
+    hits = {"success": count - rates["collision_rate"].hits, "goal": goal, "fallen": rates["fallen_rate"].hits}
     return {
         "episodes": recording.num_episodes,
         "invalid_episodes": recording.num_episodes - count,
@@ -253,14 +254,17 @@ def describe(source: ReplaySource, terrain: ReplayTerrain, recording: Recording)
     lines = _TEMPLATES.get_template("replay.txt").render(run=run, elite=elite, controller=source.by, **about)
     indent: Any = {"initial_indent": "  ", "subsequent_indent": "    ", "break_on_hyphens": False}
     text = [textwrap.fill(line, 80, **indent) for line in lines.splitlines()]
-    return "\n".join([make_title(recording, source.by), *_format_numbers(columns, source.fitness), *text])
+    numbers = _format_numbers(columns, source.fitness, rate_labels(asked_of(recording.ground)))
+    return "\n".join([make_title(recording, source.by), *numbers, *text])
 
 
-def _format_numbers(columns: Sequence[tuple[str, Evaluation, int]], fitness: FitnessCfg) -> list[str]:
-    """A row a number, and a column an evaluation, of which one elite is shown."""
+def _format_numbers(
+    columns: Sequence[tuple[str, Evaluation, int]], fitness: FitnessCfg, labels: dict[str, str]
+) -> list[str]:
+    """A row a number, rates by their labels, and a column an evaluation, of which one elite is shown."""
     rows = {"": [label for label, _, _ in columns]}
     rows["episodes"] = [str(values.episodes[n]) for _, values, n in columns]
-    for label, rate in (("goal reached", "goal_rate"), ("base collision", "collision_rate"), ("fallen", "fallen_rate")):
+    for rate, label in labels.items():
         texts = rows[label] = []
         for _, values, n in columns:
             count = int(values.counted[n]) if values.valid[n] else 0

@@ -79,15 +79,6 @@ class SpaceFlag:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LikelyFlag:
-    """The option that says how likely conditions are."""
-
-    likely: Path | None = None
-    """File that says how conditions are distributed, as sim/terrains/conditions/likely.toml, which is taken if left
-    out. How likely the terrain's shape is, is left out."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class EliteFlags(SpaceFlag):
     """Options that say which elite of which run."""
 

@@ -20,8 +20,8 @@ from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import find_touches, robot_model, shown_spec
 from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.heightmap import surface_of
-from sim.terrains.maps.picture import height_colors, tinted
-from sim.terrains.terrains import GroundMaps
+from sim.terrains.maps.picture import height_colors, places, tinted
+from sim.terrains.terrains import GroundMaps, asked_of
 
 Color = tuple[float, float, float]
 """RGB, 0 to 1."""
@@ -78,12 +78,13 @@ def scene_model(
         geom.group = _HIDDEN_GROUP  # a floor of the robot's file is not the ground
     paint = ground_paint(np.pad(heights, MARGIN_NODES, mode="edge"), ground)
     _add_ground(spec, heights, paint.shape)
-    x, y = CrossingCfg.goal
-    z = float(heights[round(y / SPACING), round(x / SPACING)])
-    cylinder = {"type": mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
-    rim = [CrossingCfg.goal_radius, 0.02, 0.0]  # of the circle that counts as reaching the goal
-    spec.worldbody.add_geom(pos=[x, y, z + 0.5], size=[0.02, 0.5, 0.0], rgba=[*_GREEN, 1.0], **cylinder)
-    spec.worldbody.add_geom(pos=[x, y, z + 0.01], size=rim, rgba=[*_GREEN, 0.25], **cylinder)
+    if goal := places(asked_of(ground)).get("goal"):
+        x, y = goal
+        z = float(heights[round(y / SPACING), round(x / SPACING)])
+        cylinder = {"type": mj.mjtGeom.mjGEOM_CYLINDER, "group": 0}
+        rim = [CrossingCfg.goal_radius, 0.02, 0.0]  # of the circle that counts as reaching the goal
+        spec.worldbody.add_geom(pos=[x, y, z + 0.5], size=[0.02, 0.5, 0.0], rgba=[*_GREEN, 1.0], **cylinder)
+        spec.worldbody.add_geom(pos=[x, y, z + 0.01], size=rim, rgba=[*_GREEN, 0.25], **cylinder)
     sky = {"type": mj.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT, "width": 64}
     spec.add_texture(name="faultline_sky", rgb1=[0.72, 0.81, 0.91], rgb2=[0.96, 0.97, 0.98], height=384, **sky)
     for light in spec.lights:

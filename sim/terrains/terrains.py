@@ -76,6 +76,11 @@ class GroundMaps:
         )
 
 
+def asked_of(ground: GroundMaps | None) -> Kind:
+    """What robots are asked for on the first of the terrains of a ground; None asks for nothing special."""
+    return Kind.CROSS if ground is None else Kind(int(ground.rows[0, -1]))
+
+
 def patch_index(places: ArrayLike, length: float, count: int) -> NDArray[np.int64]:
     """Row or column of the patch at each place along an axis, which ``count`` patches divide evenly.
 

@@ -18,9 +18,13 @@ from qd.search.crossed import usual_crossed
 from qd.search.methods import METHODS
 from qd.search.presets import PRESETS
 from qd.search.results import print_summary
+from qd.show.elites import open_run
+from qd.show.view.viewed import open_viewed_run
 from qd.workers.compute import Compute
 from sim.files.command import run_command
 from sim.robots.find import get_robot
+from sim.terrains.conditions.kinds import condition_column
+from sim.terrains.conditions.likely import SHIPPED, choose_likely, read_likely
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, get_space
 from tests.builders import fresh_values
 from tests.qd import stand_in
@@ -123,12 +127,22 @@ def test_likely_conditions_are_preferred_by_a_model_that_the_run_remembers(capsy
     assert "none for push" in fails(capsys, *TINY, *pushes, "--likely", "mine.toml")
     grips = ["--space", "super_gaussian+grip", "--likely", "mine.toml"]
     assert archive(*likely, *grips, "--run-dir", "a") == 0
-    Path("mine.toml").unlink()
+    assert "--likely" in fails(capsys, "--resume", "a", *MORE, "2", "--likely", "mine.toml")
+    Path("mine.toml").rename("other.toml")
     assert archive("--resume", "a", *MORE, "2") == 0  # by the model of the run
     assert archive(*likely, *pushes, "--run-dir", "b") == archive(*TINY, *pushes, "--run-dir", "c") == 0
     a, b, c = (config_of(name)["settings"]["fitness"] for name in "abc")
     assert a["disturbances"] == {"grip": {"numbers": {"friction": 1.0}, "distribution": "exponential", "source": "me"}}
-    assert [*b["disturbances"]] == ["push"] and c["disturbances"] == {} and (b["likely"], c["likely"]) == (0.5, 0.0)
+    assert [*b["disturbances"]] == ["push"] and (b["likely"], c["likely"]) == (0.5, 0.0)
+    assert c["disturbances"] == b["disturbances"]  # it says how likely what it finds is
+    plain = choose_likely(get_space("super_gaussian+grip"))
+    assert plain["grip"].distribution != "exponential"
+    shown = open_run("anymal", Path("a"))
+    assert shown.likely == read_likely(Path("other.toml")) and open_viewed_run(Path("a")).likely == shown.likely
+    (entry,) = shown.rank().log_likelihood[:1]  # of the model of the run
+    (row,) = shown.space.condition_rows(shown.archive.genes[:1])
+    assert entry == pytest.approx(-abs(row[condition_column("friction")] - 1.0), rel=1e-6)
+    assert open_viewed_run(Path("a"), likely=SHIPPED).likely == plain
 
 
 def test_flags_come_to_the_settings_of_the_run():
@@ -195,7 +209,7 @@ def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(ca
     *_, summary, worst, following, judging = capsys.readouterr().out.splitlines()
     found = read_archive(Path("a b"))
     count = int((found.goal_rate < 0.5).sum())
-    assert count and summary.startswith(f"{count} of {len(found)} terrains stop")
+    assert count and summary.startswith(f"The robot fails {count} of {len(found)} terrains")
     assert summary.endswith("as found, not crossed again.")
     number = int(worst.split()[2].rstrip(","))
     assert found.goal_rate[number] == found.goal_rate.min()

@@ -98,7 +98,8 @@ def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any
     offsets = [(k % columns * TILE[0], k // columns * TILE[1]) for k in range(len(genes))]
     for first in range(0, len(genes), _LOT):
         lot = genes[first : first + _LOT]
-        grids, grounds = make_terrains(lot, space) if space.ground else (make_heights(lot, space, every=_EVERY), None)
+        plain = not (space.ground or space.has_conditions)
+        grids, grounds = (make_heights(lot, space, every=_EVERY), None) if plain else make_terrains(lot, space)
         for k, heights in enumerate(grids):
             pixels = relief(heights, None if grounds is None else grounds[k : k + 1])[::-1]  # y up
             image.paste(Image.fromarray(pixels).resize(TILE, Image.Resampling.BOX), offsets[first + k])

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.episode import Kind, Outcome
+from kernels.episode import Outcome
 from qd.evaluate.tables import read_tables
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
 from qd.faults.numbers import MinimalTerrains, describe_witness, fault_numbers, further_rates
 from qd.search.directory import METRICS_FILE, ROUNDS_FILE, RunDirectory, output_folder
 from qd.search.progress import Bar
-from qd.show.crossed import ARRIVED, Rate, count_rates, draw_crossing, draw_time_line
+from qd.show.crossed import Rate, count_rates, draw_crossing, draw_time_line
 from qd.show.elites import OpenedRun, open_run
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.recordings import Recordings, request_elite
@@ -23,18 +23,13 @@ from qd.workers.compute import check_policy, choose_device
 from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
 from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.provenance import without_machine
+from sim.rates import SUCCESS, rate_labels
 from sim.recording.recorder import Recording
 from sim.recording.renderer import open_context
 
-_SUCCESS = {
-    Kind.CROSS: "reaches the goal, 12 m ahead,",
-    Kind.ROUTE: "follows its route to the end",
-    Kind.STAND: "stands near its start to the end",
-}
 _OTHER_CAUSES = 3  # beside those of the first pictures; one terrain of each is shown
 _MAX_BARS = 10
 _FAULT = VERDICTS.index("fault")
-_MEANS = ("goal", "collision", "fallen")
 _MIN_TERRAINS = 10  # fewer have no interval of their mean
 
 
@@ -48,18 +43,15 @@ def write_report(
     num_elites: int = 3,
     tables: Path | None = None,
     device: str | None = None,
-    likely: Path | None = None,
 ) -> Path:
     """Writes the page about a search, or about the rounds of a hardening; returns its file, *.html.
 
     The run is a directory of either, or an archive file; the newest search of the robot, else its published archive.
-    ``num_elites`` of the worst terrains are shown close up, with another controller beside; ``tables`` of an evaluation
-    are shown if their file is given. ``likely`` is the file of
-    :func:`sim.terrains.conditions.likely.choose_likely`.
+    ``num_elites`` of the worst terrains are shown close up; ``tables`` is the file of an evaluation to show, too.
     """
     if run is not None and (run / ROUNDS_FILE).exists():
         return write_rounds(run, robot, out)
-    opened_run = open_run(robot, run, space=space, likely=likely)
+    opened_run = open_run(robot, run, space=space)
     archive = opened_run.archive
     ranking = opened_run.rank(judged=True)
     if not len(ranking):
@@ -130,7 +122,7 @@ def cross_cases(
                 ghost = None if name is None else (name, recorded[number, files[name]])
                 cases[number] = case = _make_case(run, ranking, number, recording, ghost, pictured)
                 if number in heads:
-                    title = f"{archive.robot}, elite {number} of {len(archive):,}: {case['rate'].count} crossings"
+                    title = f"{archive.robot}, elite {number} of {len(archive):,}: {case['rate'].count} episodes"
                     case["figure"] = page.encode_picture(draw_crossing(recording, title))
             bar.move_to(done)
     return cases
@@ -149,10 +141,10 @@ def _make_case(
     sources = page.render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
     beside = None
     if ghost is not None:
-        rate = count_rates(ghost[1])[ARRIVED]
+        rate = count_rates(ghost[1])["goal_rate"]
         beside = {"name": ghost[0], "source": sources[1], "time_s": moments[1][2], "rate": rate}
     row = ranking.find_row(number)
-    rate = count_rates(recording)[ARRIVED]
+    rate = count_rates(recording)["goal_rate"]
     tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
     rates = {"for this page": rate, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
     rates |= {label: Rate(*counts) for label, counts in further_rates(opened_run.archive, number).items()}
@@ -171,9 +163,7 @@ def _make_case(
         "time_line": page.encode_picture(draw_time_line(acting, recording)) if in_time else "",
         "figure": "",
         "rate": rate,
-        "rates": page.Table(
-            head=["goal reached" if not opened_run.space.asks else "done", "", "95 % interval"], rows=rows
-        ),
+        "rates": page.Table(head=[SUCCESS[opened_run.space.asks], "", "95 % interval"], rows=rows),
     }
 
 
@@ -185,6 +175,7 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
     run = RunDirectory(opened_run.folder)
     space = opened_run.space
     searched, _ = opened_run.as_searched()
+    labels = rate_labels(space.asks)
     file = run.path / METRICS_FILE  # a run that goes on meanwhile may have some rows more
     metrics = run.read_metrics()[: archive.iterations] if file.exists() else []
     if file.exists() and len(metrics) < archive.iterations:
@@ -195,7 +186,7 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
         controller = "a controller that is not at hand"
     return {
         "archive": archive,
-        "success": _SUCCESS[space.asks],
+        "success": SUCCESS[space.asks],
         "run": opened_run.command,
         "search": search,
         "metrics": metrics,
@@ -208,7 +199,7 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
         "certifiers": " or ".join(archive.certifiers + ("a robot that is steered",) * (archive.witnesses is not None)),
         "numbers": fault_numbers(archive),
         "fault_families": len(np.unique(ranking.families[ranking.verdict == _FAULT])),
-        "means": {name: format_mean(getattr(ranking, f"{name}_rate"), ranking.families) for name in _MEANS},
+        "means": {label: format_mean(getattr(ranking, rate), ranking.families) for rate, label in labels.items()},
         "causes": count_causes(ranking),
         "tiles": page.draw_sheet(archive.genes[ranking.numbers], space),
         "elites": _list_elites(ranking),
@@ -252,22 +243,21 @@ def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
 
 def _list_elites(ranking: Ranking) -> dict[str, Any]:
     """Every elite, faults first, then what fails most: rows of pictures with cells, and columns not for a phone."""
+    labels = rate_labels(ranking.asks)
     rows = {
         row: {
             "elite": f"{ranking.numbers[row]}",
             "what happens": ranking.name(row),
             "verdict": VERDICTS[int(ranking.verdict[row])],
-            "goal [%]": f"{100 * ranking.goal_rate[row]:.0f}",
+            **{f"{label} [%]": f"{100 * getattr(ranking, rate)[row]:.0f}" for rate, label in labels.items()},
             "95 % interval": Rate(ranking.hits("goal_rate", row), int(ranking.counted[row])).limits,
-            "base collision [%]": f"{100 * ranking.collision_rate[row]:.0f}",
-            "fallen [%]": f"{100 * ranking.fallen_rate[row]:.0f}",
             "family": f"{ranking.families[row]}",
             "fitness": f"{ranking.fitness[row]:.1f}",
         }
         | ({} if (known := ranking.log_likelihood) is None else {"log-likelihood of conditions": f"{known[row]:.1f}"})
         for row in ranking.by_severity().tolist()
     }
-    return {"rows": [*rows.items()], "wide": (5, 6, 7, 8, 9, 10)}
+    return {"rows": [*rows.items()], "wide": (5, 6, 7, 8, 9, 10, 11)}
 
 
 def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:
@@ -276,7 +266,7 @@ def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:
             "elite": f"{entry['elite']}",
             "cause": describe_cause(entry["cause"]),
             "parts left": f"{len(entry['bumps'])} of {entry['of']}",
-            "goal [%]": "-" if entry["goal_rate"] is None else f"{100 * entry['goal_rate']:.0f}",
+            "passed [%]": "-" if entry["goal_rate"] is None else f"{100 * entry['goal_rate']:.0f}",
             "95 % interval": "{:.0f} to {:.0f} %".format(*(100 * limit for limit in entry["goal_interval"])),
             "margin [cm]": "-" if entry["margin_m"] is None else f"{100 * entry['margin_m']:.1f}",
             "verdict": str(entry.get("verdict", "")),

@@ -23,10 +23,11 @@ from viser import _messages, uplot
 
 from kernels.penalties import PENALTIES
 from qd.faults.families import summarise_search
-from qd.show.crossed import ENDINGS
+from qd.show.crossed import all_endings
 from qd.show.view.playing import Crossing
 from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
 from qd.show.view.viewed import FITNESS_TEXT, TEMPLATES, Column, ViewedRun, render_rates
+from sim.rates import rate_labels
 from sim.recording.renderer import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
 from sim.terrains.maps.picture import SLIPPERY, SOFT, height_colors
 
@@ -179,6 +180,7 @@ class CrossingPanel:
         gui = tab.client.gui
         post = tab.shared.post
         controllers = tab.show.controllers
+        self._rates = rate_labels(tab.show.space.asks)
         if tab.window[0] >= PHONE:  # in a narrower window viser makes a sheet of all panels
             gui.main_panel.dock_right()
             gui.main_panel.set_width(_WIDTH if tab.window[0] >= _WIDE else _NARROW_WIDTH)
@@ -207,7 +209,7 @@ class CrossingPanel:
             colors = (SLIPPERY, SOFT, TOUCH, FOOT_TOUCH, FORCE_COLOR, COMMAND_COLOR, OTHER_CONTROLLER)
             legend = TEMPLATES.get_template("legend.html").render(
                 ramp=", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0])))),
-                endings=[(ending.label, ending.color) for ending in ENDINGS.values()],
+                endings=[(ending.label, ending.color) for ending in all_endings(tab.show.space.asks).values()],
                 **dict(zip(names, map(to_hex, colors), strict=True)),
             )
             gui.add_html(legend)
@@ -216,7 +218,7 @@ class CrossingPanel:
 
     def show_rates(self, columns: Sequence[Column]) -> None:
         """Show how episodes ended."""
-        self.rates.content = _small(render_rates(columns)) if columns else ""
+        self.rates.content = _small(render_rates(columns, self._rates)) if columns else ""
 
     def show_film(self, text: str) -> None:
         """Show the progress of a film."""

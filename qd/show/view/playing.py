@@ -95,7 +95,7 @@ def trace_crossing(
 def describe_ending(recording: Recording, replica: int, after: str = "") -> str:
     """How an episode of one terrain ended, and whether the robot had fallen then."""
     fallen = " · fallen" if recording.fallen[0, replica] else ""
-    return get_ending(recording.outcome[0, replica]).label + after + fallen
+    return get_ending(recording, replica).label + after + fallen
 
 
 def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], ...]:
@@ -117,22 +117,21 @@ def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], .
     marks = [(recording.dt * int(np.argmax(when)), label) for label, when in events.items() if when.any()]
     if recording.outcome[0, replica] == Outcome.TIME_OUT and not events["fall"].any():
         marks.append((find_failure_time(recording, replica), "stuck"))
-    marks.append((recording.dt * (frames - 1), f"end: {get_ending(recording.outcome[0, replica]).label}"))
+    marks.append((recording.dt * (frames - 1), f"end: {get_ending(recording, replica).label}"))
     return tuple(sorted(marks, key=lambda mark: mark[0]))
 
 
 def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
     """Numbers of the episodes of one terrain, from 1, and how each ended, by ending, the commonest first."""
     groups = defaultdict[str, list[tuple[int, str]]](list)
-    for k, outcome in enumerate(recording.outcome[0].tolist()):
-        groups[get_ending(outcome).label].append((k + 1, f"episode {k + 1}: {describe_ending(recording, k)}"))
-    replicas = recording.outcome.shape[1]
+    for k in range(recording.num_episodes):
+        groups[get_ending(recording, k).label].append((k + 1, f"episode {k + 1}: {describe_ending(recording, k)}"))
     commonest_first = sorted(groups.items(), key=lambda group: -len(group[1]))
-    return [(f"{len(members)} of {replicas}: {label}", members) for label, members in commonest_first]
+    return [(f"{len(members)} of {recording.num_episodes}: {label}", members) for label, members in commonest_first]
 
 
 def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, ...]]]:
     """The base at every tenth frame and the last [m], (num_points, 3), and the outcome's colour, by episode."""
-    colors = [ImageColor.getrgb(get_ending(outcome).color) for outcome in recording.outcome[0].tolist()]
+    colors = [ImageColor.getrgb(get_ending(recording, k).color) for k in range(recording.num_episodes)]
     chosen = [[*range(0, last, every), last] if last >= 0 else [] for last in (recording.num_frames[0] - 1).tolist()]
     return [(recording.base_position[0, k, chosen[k]], color) for k, color in enumerate(colors)]

@@ -1,4 +1,4 @@
-"""The 3-D view of a tab: terrain, start and goal, robot, what touches, arrows and paths.
+"""The 3-D view of a tab: terrain, start and any goal, robot, what touches, arrows and paths.
 
 Colours of vertices are in linear light, as glTF and the browser want them.
 """
@@ -20,8 +20,8 @@ from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
 from sim.terrains.hand_crafted import SPACING
 from sim.terrains.maps.heightmap import surface_of
-from sim.terrains.maps.picture import height_colors, tinted
-from sim.terrains.terrains import GroundMaps
+from sim.terrains.maps.picture import height_colors, places, tinted
+from sim.terrains.terrains import GroundMaps, asked_of
 
 FORCE_COLOR = (0.84, 0.10, 0.11)
 """Arrows of contact forces, RGB, 0 to 1."""
@@ -150,7 +150,7 @@ class Scene:
         It is blue below 0 and brown above, with a darker line every metre; friction and softness tint it.
         """
         start = CrossingCfg.start
-        goal = CrossingCfg.goal
+        goal = places(asked_of(ground)).get("goal")
         scene = self._client.scene
         color = height_colors(heights)
         color = 255.0 * (color if ground is None else tinted(color, ground))
@@ -161,11 +161,13 @@ class Scene:
         with self._client.atomic():
             self.hide_crossing()
             scene.add_mesh_trimesh("/terrain", surface, cast_shadow=False, receive_shadow=0.45)
-            low, high = surface_heights(heights, *np.array([start, goal]).T).tolist()
+            low = float(surface_heights(heights, *np.array(start)))
             scene.add_cylinder("/start/disc", _START_RADIUS, color=(255, 255, 255), position=(*start, low), **_DISC)
             before = (start[0] - _START_RADIUS, start[1], low)
             scene.add_label("/start/label", "start", position=before, anchor="top-center")
-            radius = CrossingCfg.goal_radius
+            if goal is None:
+                return
+            high, radius = float(surface_heights(heights, *np.array(goal))), CrossingCfg.goal_radius
             scene.add_cylinder("/goal/disc", radius, color=_GOAL_COLOR, position=(*goal, high), **_DISC)
             scene.add_cylinder("/goal/post", 0.03, 1.0, _GOAL_COLOR, position=(*goal, high + 0.5))
             scene.add_label("/goal/label", "goal", position=(*goal, high + 1.0), anchor="bottom-center")

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from qd.faults.families import ORDERS, VERDICTS, Ranking
 from qd.faults.numbers import best_certifier, describe_judgement
-from qd.show.crossed import ARRIVED, FAILED, count_rates
+from qd.show.crossed import count_rates
 from qd.show.elites import OpenedRun, open_run
 from qd.show.recordings import CrossingRequest, request_elite
 from qd.workers.compute import check_policy
 from sim.controllers.spec import ControllerSpec, parse_controllers
-from sim.crossing import CrossingCfg
 from sim.files.intervals import format_rate
 from sim.files.templates import open_templates
+from sim.rates import rate_labels
 from sim.recording.recorder import Recording
+from sim.terrains.maps.picture import places
 
 SEARCHED = "searched controller"
 """Name of the search's controller on the page, if no other is given."""
@@ -31,15 +32,9 @@ TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _GREY = "#d8d8d8"
 _LISTED = "#2171b5"
 _PICKED = "#d55e00"
-_RATES = {
-    "goal_rate": "reached the goal",
-    "collision_rate": "base collision",
-    "other_rate": "out of time, off it",
-    "fallen_rate": "fallen",
-}
 FITNESS_TEXT = (
     "what the search looks for: mean scaled penalties, less their spread over episodes, less a share of episodes "
-    "without a base collision where others have one; whether the robot fails is said by the goal rate"
+    "without a base collision where others have one; whether the robot fails is said by how often it passes"
 )
 """What fitness is, and what it is not."""
 
@@ -85,15 +80,15 @@ class ViewedRun(OpenedRun):
         return request_elite(self.archive, elite, policy=self.controllers[controller], minimal=genes)
 
     def find_certifier(self, number: int) -> tuple[str | None, str]:
-        """Name of the controller that crosses a failing elite most often, or why there is none to show."""
+        """Name of the controller that passes a failing elite most often, or why there is none to show."""
         archive = self.archive
         name = self.certifier(number)
         if name is not None and self.controllers.get(name) == self.certifiers()[name]:
             return name, ""
         if not archive.certified_by_controllers[number]:
-            return None, "No other controller is known to cross it." if archive.failing[number] else ""
+            return None, "No other controller is known to pass it." if archive.failing[number] else ""
         names = compress(archive.certifiers, archive.certificates[number].tolist())
-        return None, f"{' and '.join(names)} crosses it, but is not at hand: name its file with --policies."
+        return None, f"{' and '.join(names)} passes it, but is not at hand: name its file with --policies."
 
     def list_elites(self, cause: str = "", order: str = next(iter(ORDERS))) -> NDArray[np.int64]:
         """Numbers of the elites of a cause, or of all, in one of the :data:`qd.faults.families.ORDERS`."""
@@ -121,14 +116,15 @@ class ViewedRun(OpenedRun):
         ends = self.ranking.end_position.tolist()
         dots = [(number, ends[number], *look) for number, look in looks.items() if np.isfinite(ends[number]).all()]
         template = TEMPLATES.get_template("map.html")
-        return template.render(dots=dots, names=self._names, start=CrossingCfg.start, goal=CrossingCfg.goal)
+        return template.render(dots=dots, names=self._names, places=places(self.space.asks))
 
     def columns(self, number: int) -> Sequence[Column]:
         """Episodes on the whole terrain: fresh, finer contact, varied conditions, and of the best certifier."""
         ranking = self.ranking
         archive = self.archive
         first = "fresh" if ranking.is_fresh[number] else "as found"
-        hits = {name: ranking.hits(name, number) for name in _RATES}
+        rates = rate_labels(self.space.asks)
+        hits = {name: ranking.hits(name, number) for name in rates}
         columns: list[Column] = [(first, int(ranking.counted[number]), hits)]
         further = {"finer contact": archive.resolved_outcomes[number]}
         if archive.varied is not None:
@@ -137,7 +133,7 @@ class ViewedRun(OpenedRun):
             further[name] = archive.certifier_outcomes[number, archive.certifiers.index(name)]
         for head, ends in further.items():
             if ends.any():
-                columns.append((head, int(ends[:3].sum()), dict(zip(_RATES, ends[:3].tolist(), strict=False))))
+                columns.append((head, int(ends[:3].sum()), dict(zip(rates, ends[:3].tolist(), strict=False))))
         return columns
 
     def details(self, number: int) -> str:
@@ -158,15 +154,12 @@ class ViewedRun(OpenedRun):
 def count_endings(head: str, recording: Recording) -> Column:
     """The recorded episodes of a controller."""
     rates = count_rates(recording)
-    hits = {label: rate.hits for label, rate in rates.items()}
-    collision, *others = FAILED
-    counts = (hits[ARRIVED], hits[collision], sum(hits[label] for label in others), hits["fallen"])
-    return head, rates[ARRIVED].count, dict(zip(_RATES, counts, strict=True))
+    return head, rates["goal_rate"].count, {name: rate.hits for name, rate in rates.items()}
 
 
-def render_rates(columns: Sequence[Column]) -> str:
-    """HTML of how episodes ended: a row an ending and a column a controller, with 95 % intervals (Wilson)."""
-    return TEMPLATES.get_template("rates.html").render(columns=columns, rates=_RATES, format_rate=format_rate)
+def render_rates(columns: Sequence[Column], rates: Mapping[str, str]) -> str:
+    """HTML of how episodes ended: a row a rate and a column a controller, with 95 % intervals (Wilson)."""
+    return TEMPLATES.get_template("rates.html").render(columns=columns, rates=rates, format_rate=format_rate)
 
 
 def open_viewed_run(

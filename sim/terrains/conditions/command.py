@@ -27,7 +27,7 @@ class Segment(Condition):
         )
         self.dose = None
         if number == 2:
-            title = f"yaw rate in the second of {SEGMENTS} parts of the time"
+            title = f"route: yaw rate in the second of {SEGMENTS} parts of the time"
             self.dose = Sweep(f"{self.name}_turn", (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), title=title)
         self._number = number
 

@@ -69,23 +69,20 @@ def read_likely(file: Path = SHIPPED) -> dict[str, Disturbance]:
     return entries
 
 
-def choose_likely(space: Any, file: Path | None = None, *, needed: bool = False) -> dict[str, Disturbance] | None:
+def choose_likely(space: Any, file: Path | None = None, *, needed: bool = False) -> dict[str, Disturbance]:
     """The entries of a file, or of the shipped one, for the conditions of a space.
 
-    None of a space without conditions, and where the shipped file lacks one; refused where they are ``needed``, or a
-    file is named.
+    There are none where one is lacking, or no condition; that is refused if they are ``needed``, or a file is named.
     """
     entries = read_likely(file or SHIPPED)
     lacking = [name for name in space.conditions if name not in entries]
     if space.conditions and not lacking:
         return {name: entries[name] for name in space.conditions}
-    if not needed and file is None:
-        return None
-    if not space.conditions:
-        rule = "how likely conditions are can be said in a space with conditions, such as +push"
-        raise ValueError(f"{rule}, got {space.name}: leave --likely and --fitness.likely out")
-    rule = f"{file or SHIPPED} must have an entry for each condition of {space.name}"
-    raise ValueError(f"{rule}, got none for {', '.join(lacking)}: name a file that has, with --likely")
+    if needed or file is not None:
+        rule = f"{file or SHIPPED} must have an entry for each of the conditions of {space.name}"
+        remedy = "name a file that has, with --likely, and a space with conditions, such as +push"
+        raise ValueError(f"{rule}, got none for {', '.join(lacking) or 'it'}: {remedy}")
+    return {}
 
 
 def find_log_likelihood(rows: NDArray[np.floating], entries: Mapping[str, Disturbance]) -> NDArray[np.float64]:

@@ -7,17 +7,20 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
+from kernels.episode import Kind
 from kernels.ground import MAX_TIME_CONSTANT_S, MIN_FRICTION, MIN_TIME_CONSTANT_S, PATCHES
 from sim.crossing import CrossingCfg
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
-from sim.terrains.terrains import GroundMaps, patch_index
+from sim.terrains.terrains import GroundMaps, asked_of, patch_index
 
 LENGTH, WIDTH = 16.0, 8.0
 """Of a terrain [m]."""
 _WHITE: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "", "zorder": 4}
-START: dict[str, Any] = {"marker": ">", "markersize": 11, "label": "start", **_WHITE}
-GOAL: dict[str, Any] = {"marker": "*", "markersize": 16, "label": "goal", **_WHITE}
-"""How start and goal are marked."""
+MARKS: dict[str, dict[str, Any]] = {
+    "start": {"marker": ">", "markersize": 11, "label": "start", **_WHITE},
+    "goal": {"marker": "*", "markersize": 16, "label": "goal", **_WHITE},
+}
+"""How :func:`places` are marked."""
 _PALE = 0.6  # opacity of a map
 
 HEIGHTS = LinearSegmentedColormap.from_list("heights", [(0.36, 0.50, 0.66), (0.80, 0.79, 0.74), (0.70, 0.44, 0.27)])
@@ -66,8 +69,13 @@ def tinted(colors: NDArray[np.float64], ground: GroundMaps, margin: int = 0) -> 
     return colors + lines[..., 3:] * (lines[..., :3] - colors)
 
 
+def places(asks: Kind) -> dict[str, tuple[float, float]]:
+    """``start``, and ``goal`` where robots are asked for one, world-local x and y [m]."""
+    return {"start": CrossingCfg.start} | ({"goal": CrossingCfg.goal} if asks == Kind.CROSS else {})
+
+
 def draw_heights(axes: Axes, heights: NDArray[np.float32], ground: GroundMaps | None = None) -> Any:
-    """Heights [m], shape (nrow, ncol), from above with start and goal, and the lines of its ground; returns the image.
+    """Heights [m], shape (nrow, ncol), from above with :func:`places` and the lines of its ground; returns the image.
 
     Colours are those of the ground in other pictures, paler, so that paths are seen on them.
     """
@@ -76,8 +84,8 @@ def draw_heights(axes: Axes, heights: NDArray[np.float32], ground: GroundMaps | 
     image = axes.imshow(heights, cmap=HEIGHTS, vmin=-most, vmax=most, alpha=_PALE, **where)
     if ground is not None:
         axes.imshow(ground_lines(ground, heights.shape[0], heights.shape[1]), interpolation="nearest", **where)
-    for place, look in ((CrossingCfg.start, START), (CrossingCfg.goal, GOAL)):
-        axes.plot(*place, **look)
+    for name, place in places(asked_of(ground)).items():
+        axes.plot(*place, **MARKS[name])
     axes.set_ylabel("y [m]")
     axes.set_aspect("equal")
     return image

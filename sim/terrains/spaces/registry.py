@@ -30,12 +30,7 @@ SPACES: dict[str, ShippedSpace] = {SUPER_GAUSSIAN.name: SUPER_GAUSSIAN, COURSE.n
 
 
 class UserSpace(TerrainSpace):
-    """A user's space, named ``file.py:Space`` or ``module:Space``; what its code returns is checked.
-
-    Its ``code`` has (docs/terrains.md) ``num_genes`` and ``rasterise(genes, x, y)``; optionally ``hard_random(count,
-    rng)``, ``describe(genes)``, ``parts(genes)`` with ``without(genes, parts)``, ``scaled(genes, scale)``,
-    ``friction(genes, x, y)``, ``softness(genes, x, y)``, ``genes_per_part``, ``sigma0``.
-    """
+    """A user's space, ``file.py:Space`` or ``module:Space`` (docs/terrains.md); what its code returns is checked."""
 
     def __init__(self, spec: str, code: Any) -> None:
         self.name, self._code = spec, code
@@ -195,8 +190,8 @@ def load_space(name: str | None) -> TerrainSpace:
     """A space that the command line names; a user's code is run, and :func:`get_space` finds it from then on.
 
     A name is a shipped space's, ``file.py:Space`` or ``module:Space``, a class without arguments, and behind it ground,
-    conditions, groups of these and a task, as in ``course+friction+push``; None is the paper's space. All of a user's
-    space is tried on three terrains. Code that was loaded before, and has not changed, is not run again.
+    conditions, groups of these and a task, as in ``course+friction+push``; None is the paper's. A user's space is tried
+    on three terrains, and unless it has changed once.
     """
     base, kinds = split_name(name or SUPER_GAUSSIAN.name)
     once = "+".join((base, *kinds))

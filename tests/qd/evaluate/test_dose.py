@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from qd.evaluate.dose import all_doses, dose_set, find_half, measure_dose, measure_rates, parse_doses
+from sim.robots.find import get_robot
 from sim.terrains.bank import make_terrains
 from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.elements.kinds import FIRST_COL, NUM_STARTS
@@ -14,6 +15,7 @@ from sim.terrains.spaces.registry import get_space
 from tests.kernels.oracle import course, course_heights, element
 from tests.qd.robots import Robots
 from tests.qd.stand_in import BAD, GOAL, HIT, LATE, compute_by, result_of
+from tests.sim.dogs import write_toml
 
 STRONG, WEAK = "tests.sim.policies:stand", "tests.sim.policies:stretch"
 LIMITS = {STRONG: 0.27, WEAK: 0.12}
@@ -200,3 +202,20 @@ def test_a_command_line_names_doses():
 def test_what_cannot_be_made_is_refused(elements, at, field):
     with pytest.raises(ValueError, match=field):
         parse_doses([elements], [at])
+
+
+SEEN = {"estimate": ('{term = "gravity"}', "lin_vel"), "map_late": ('{term = "lin_vel"}', "scan")}
+"""What a controller sees, and what it would have to see for the condition to disturb it."""
+
+
+@pytest.mark.parametrize("elements", SEEN)
+def test_what_a_controller_does_not_see_is_refused_before_any_work(anymal, tmp_path, elements):
+    sees, lacks = SEEN[elements]
+    file = tmp_path / "controller.toml"
+    file.write_text(f'policy = "net.pt"\nobservation = [{{term = "ang_vel"}}, {sees}]\naction_scale = 0.5\n')
+    doses, given = parse_doses([f"sill=0.1 {elements}"], []), {"compute": compute_by(None), "out": tmp_path / "a.json"}
+    with pytest.raises(ValueError, match=rf"{lacks}.*\+{elements}"):
+        measure_dose(anymal, {"base": str(file)}, doses, **given)
+    robot = get_robot(str(write_toml(tmp_path / "a")))  # which was never measured under routes
+    with pytest.raises(ValueError, match="stray_m"):
+        measure_dose(robot, {"base": STRONG}, parse_doses(["sill=0.1 segment_2"], []), **given)

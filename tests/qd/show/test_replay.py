@@ -78,12 +78,12 @@ def lines_of(opened_run, recording, policy=None):
 
 def test_an_elites_numbers_are_raw_with_units_beside_the_fresh_ones(opened_run, recording, anymal):
     lines = lines_of(opened_run, recording)
-    assert lines[0] == "ANYmal C, made up: crosses it, 3 of 4"
+    assert lines[0] == "ANYmal C, made up: reaches the goal, 3 of 4"
     assert "yaw-rate error 1.00±0.50, 35% 2.00±0.00, 33%" in lines
     assert "forward-velocity error 6.00±1.00, 65% 16.00±0.00, 67%" in lines
     # Wilson, z^2 = 3.8415, of 1 of 4: (.25 + .4802 +- 1.96 sqrt(.0469 + .0600)) / 1.9604 = .3725 +- .3269
     assert "base collision 25% (5-70%) 25% (5-70%)" in lines
-    assert "goal reached 75% (30-95%) 75% (30-95%)" in lines
+    assert "reaches the goal 75% (30-95%) 75% (30-95%)" in lines
     assert "fitness 3.25 10.50" in lines  # fresh: 4 + 8 - 0 - 2 * 3/4
     dear = np.tile([16.0, 2.0, 0.0, 0.0, 0.0, 0.0], (4, 1))[None, :, None] * np.linspace(0.0, 1.0, FRAMES)[:, None]
     far = dataclasses.replace(recording, penalties=dear.astype(np.float32))
@@ -138,7 +138,7 @@ def test_the_drawing_has_all_paths():
     assert sum(len(np.asarray(line.get_xdata())) == FRAMES for line in axes.lines) == 2
     assert axes.images[0].get_array().shape == (161, 321)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels[:4] == ["reached the goal (1)", "out of time (1)", "start", "goal"]
+    assert labels[:4] == ["reaches the goal (1)", "gets stuck (1)", "start", "goal"]
 
 
 def test_the_witness_of_an_elite_is_its_walker_steered(tmp_path, anymal):
@@ -338,8 +338,8 @@ def test_elites_are_exported_as_the_simulation_has_them(run):
         assert about["ratios"] == dict(zip(archive.penalties, archive.ratios[elite].tolist(), strict=True))
         assert {"command", "commit", "versions", "date", "run", "space"} <= about.keys() and "seed" not in about
         assert about["verdict"] == ("not failing" if elite == 2 else "failing")
-        assert (about["cause"] is None) == (about["ending"] == "crossed") == (elite == 2)
-        assert about["in_words"].startswith("crossed, 36 of 40" if elite == 2 else f"{about['cause']}: ")
+        assert (about["cause"] is None) == (about["ending"] == "reaches the goal") == (elite == 2)
+        assert about["in_words"].startswith("reaches the goal, 36 of 40" if elite == 2 else f"{about['cause']}: ")
     index = json.loads((folder / "index.json").read_text())
     assert [(row["elite"], row["files"]) for row in index["elites"]] == [(k, f"elite-{k}") for k in elites]
 

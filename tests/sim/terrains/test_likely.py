@@ -52,7 +52,7 @@ def test_a_file_of_a_user_is_checked_and_a_condition_without_an_entry_is_named(t
         choose_likely(get_space("course"), file)
     with pytest.raises(ValueError, match=f"{file}.*none for push"):
         choose_likely(get_space("super_gaussian+payload+push"), file)
-    assert choose_likely(get_space("course")) is None
+    assert choose_likely(get_space("course")) == {}
     wrong = {"0.1": "0", "uniform": "normal", "payload = 0": "mass = 0", "[payload]": "[load]", '"assumed"': '""'}
     wrong |= {'source = "assumed"': "", 'source = "assumed"\n': 'source = "assumed"\nscale = 1\n'}
     for before, after in wrong.items():
@@ -64,6 +64,6 @@ def test_a_file_of_a_user_is_checked_and_a_condition_without_an_entry_is_named(t
 def test_a_condition_without_an_entry_leaves_the_likelihood_unknown_until_it_is_asked_for(monkeypatch):
     space = get_space("super_gaussian+grip")
     monkeypatch.setattr("sim.terrains.conditions.likely.read_likely", lambda file: {})
-    assert choose_likely(space) is None
+    assert choose_likely(space) == {}
     with pytest.raises(ValueError, match="none for grip"):
         choose_likely(space, needed=True)

@@ -65,9 +65,9 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
 def test_the_page_begins_with_the_sentence_and_has_the_numbers_of_the_files(whole):
     content, archive = whole[0].read_text(), read_archive(whole[0].parent)
     ranking, text = rank(archive, SUPER_GAUSSIAN, half_width=0.4, judged=True), text_of(content.encode())
-    assert text.startswith(f"anymal: terrains that stop it {summarise_search(ranking, archive)}")
+    assert text.startswith(f"anymal: terrains that it fails {summarise_search(ranking, archive)}")
     failing = int((archive.fresh.goal_rate < 0.5).sum())
-    assert f"stop the robot {failing}" in text and "40 terrains and 160 episodes in 10 s" in text
+    assert f"failed {failing}" in text and "40 terrains and 160 episodes in 10 s" in text
     assert "for this page 5 of 20 11 to 47 %" in text
     for number in ranking.worst(2):
         row = ranking.find_row(number)
@@ -144,7 +144,7 @@ def test_archives_of_any_size_alone_and_without_fresh_values(reported, run, size
     text = text_of(reported()[0].read_bytes())
     assert "metrics.jsonl" in text and "config.json" in text
     assert text.count("Not judged yet") == 1 and "confirmed" not in text
-    assert ("What stops it" in text) == (sizes[2] == 0)
+    assert ("Why it fails" in text) == (sizes[2] == 0)
 
 
 def test_what_cannot_be_crossed_is_left_out(reported, run):

@@ -110,7 +110,7 @@ def test_an_elite_opens_a_second_before_the_robot_fails_and_plays(shown, show, w
     name = show.ranking.name(0)
     assert tab.bar.shown["title"] == name and name in tab.panel.head.content and "elite 0 " in tab.panel.head.content
     assert tab.scene.robot.visible and tab.bar.shown["enabled"]
-    assert status(tab).startswith("base collision") and tab.bar.shown["episodes"][0][0] == "19 of 20: base collision"
+    assert status(tab).startswith("hits the ground") and tab.bar.shown["episodes"][0][0] == "19 of 20: hits the ground"
     shown.do((tab.choose_replica, 0))
     assert tab.clock.duration_s == pytest.approx(6.19) and tab.bar.shown["duration"] == tab.clock.duration_s
     assert tab.clock.time_s == pytest.approx(max(0.0, find_failure_time(recording, 0) - 1.0)) and tab.playing
@@ -147,8 +147,8 @@ def test_what_one_tab_does_no_other_tab_sees(shown):
     assert first.playing and not second.playing and not second.scene.follow
     assert second.list.list.content == before != first.list.list.content and second.selection.picked == 171
     shown.do((second.pick, 0))
-    assert status(second).startswith("base collision") and second.playing
-    assert status(first).startswith("out of time")
+    assert status(second).startswith("hits the ground") and second.playing
+    assert status(first).startswith("gets stuck")
     shown.sockets[1].close()
     wait_until(lambda: shown.app.do_tasks(wait_s=0.1) or len(shown.app.tabs) == 1)
     assert list(shown.app.tabs.values()) == [first] and first.playing  # it is left alone
@@ -162,7 +162,7 @@ def test_a_link_opens_what_it_was_copied_from(shown):
     assert query.startswith("elite=0&controller=other&episode=17&t=1.25&follow=1&initialCameraPosition=")
     second = shown.come(f"?{query}")
     assert (second.controller, second.replica, second.clock.time_s) == ("other", 16, 1.25)
-    assert second.panel.controller.value == "other" and status(second).startswith("out of time")
+    assert second.panel.controller.value == "other" and status(second).startswith("gets stuck")
     assert second.scene.follow and second.bar.shown["follow"] and not second.playing
     second.show_address()
     assert second.address.query().startswith("elite=0&controller=other&episode=17&t=1.25&follow=1")
@@ -208,7 +208,7 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
     with closing(Shown(dataclasses.replace(show, minima=minima), recordings)) as shown:
         tab = shown.tab
         assert tab.panel.terrain.visible and tab.panel.terrain.value == "whole"
-        assert "**Minimal terrain**: 1 of 8 parts; goal reached 10% (3 to 25%)" in tab.panel.details.content
+        assert "**Minimal terrain**: 1 of 8 parts; passed 10% (3 to 25%)" in tab.panel.details.content
         assert "fresh" in tab.panel.rates.content
         shown.do((tab.choose_terrain, True))
         assert shown.asked[-1].label == "minimal terrain of elite 0 of anymal" and not tab.scene.robot.visible
@@ -229,13 +229,13 @@ def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
     shown.do((tab.choose_ghost, "other"), (tab.seek, 5.0))  # the same file, so the same crossing
     assert tab.scene.ghost.visible and tab.scene.robot.visible
     np.testing.assert_array_equal(tab.scene.ghost_bodies[0].position, tab.scene.bodies[0].position)
-    assert "Ghost, other: base collision" in status(tab)  # it arrives in no episode
+    assert "Ghost, other: hits the ground" in status(tab)  # it arrives in no episode
     arrives = tab.ghost.recording.outcome.copy()
     arrives[0, 3] = Outcome.GOAL
     tab.ghost.recording = dataclasses.replace(tab.ghost.recording, outcome=arrives)
     for episode, words in ((3, "other"), (0, "other in episode 4")):
         shown.do((tab.choose_replica, episode))
-        assert f"Ghost, {words}: reached the goal" in status(tab)
+        assert f"Ghost, {words}: reaches the goal" in status(tab)
     tab.show_address()
     assert "&ghost=other" in tab.address.query()
     assert shown.come(f"?{tab.address.query()}").scene.ghost.visible
@@ -271,7 +271,7 @@ def test_what_was_never_recorded_is_asked_for_and_shown_when_it_comes(shown):
     shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="it <broke>", failed=True)))
     assert status(tab) == "No crossing: it &lt;broke&gt;" and tab.bar.shown["share"] is None
     shown.do((shown.app.show_progress, TaskProgress(task=wanted, text="", result=recording)))
-    assert status(tab).startswith("base collision") and tab.scene.robot.visible
+    assert status(tab).startswith("hits the ground") and tab.scene.robot.visible
 
 
 def test_a_film_is_made_and_offered_or_cancelled(shown, tmp_path, monkeypatch):

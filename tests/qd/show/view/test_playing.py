@@ -39,7 +39,7 @@ def recording():
 def test_an_episode_is_shown_as_it_was_recorded(skeleton, recording):
     names = recording.penalty_names[::-1]
     crossing = trace_crossing(recording, 0, skeleton, dict.fromkeys(names, 2.0))
-    assert (len(crossing.positions), crossing.ending) == (FRAMES, "base collision after 0.1 s · fallen")
+    assert (len(crossing.positions), crossing.ending) == (FRAMES, "hits the ground after 0.1 s · fallen")
     np.testing.assert_allclose(crossing.positions[3, 0], [2.3, 4.0, 0.0], atol=1e-6)
     # penalty j sums j + 1 a frame; shown in the order asked for, divided by 2
     np.testing.assert_allclose(crossing.penalties[2], np.arange(len(names), 0, -1.0))
@@ -74,24 +74,24 @@ def test_marks_stand_where_things_happen_first():
     quaternion[0, 0] = np.stack([np.cos(tilts / 2), np.sin(tilts / 2), 0 * tilts, 0 * tilts], axis=1)
     made = dataclasses.replace(made, penalties=sums, base_quaternion=quaternion)
     marks = find_marks(made, 0)
-    assert [words for _, words in marks] == ["first stumble", "first collision", "fall", "end: base collision"]
+    assert [words for _, words in marks] == ["first stumble", "first collision", "fall", "end: hits the ground"]
     np.testing.assert_allclose([time_s for time_s, _ in marks], [0.16, 0.24, 0.30, 0.40])
-    assert find_marks(made, 1) == ((pytest.approx(0.4), "end: reached the goal"),)
+    assert find_marks(made, 1) == ((pytest.approx(0.4), "end: reaches the goal"),)
 
 
 def test_a_robot_that_gets_stuck_has_a_mark_where_it_stays():
     made = recording_of([Outcome.TIME_OUT], [6.0], penalties=np.zeros((1, 6)))  # 0.2 m a frame, from 2 m to 6 m
     # frame 19 lies within 0.3 m of the end
-    assert find_marks(made, 0) == ((pytest.approx(0.38), "stuck"), (pytest.approx(0.40), "end: out of time"))
+    assert find_marks(made, 0) == ((pytest.approx(0.38), "stuck"), (pytest.approx(0.40), "end: gets stuck"))
 
 
 def test_episodes_are_offered_by_how_they_ended():
     outcomes = [Outcome.TIME_OUT, Outcome.GOAL, Outcome.TIME_OUT, Outcome.BASE_COLLISION]
     made = recording_of(outcomes, [6.0] * 4, fallen=[False, False, True, True])
     assert group_episodes(made) == [
-        ("2 of 4: out of time", [(1, "episode 1: out of time"), (3, "episode 3: out of time · fallen")]),
-        ("1 of 4: reached the goal", [(2, "episode 2: reached the goal")]),
-        ("1 of 4: base collision", [(4, "episode 4: base collision · fallen")]),
+        ("2 of 4: gets stuck", [(1, "episode 1: gets stuck"), (3, "episode 3: gets stuck · fallen")]),
+        ("1 of 4: reaches the goal", [(2, "episode 2: reaches the goal")]),
+        ("1 of 4: hits the ground", [(4, "episode 4: hits the ground · fallen")]),
     ]
 
 

@@ -14,6 +14,7 @@ from qd.search.archive import write_archive
 from qd.show.view.app import check_port
 from qd.show.view.panels import Address, Clock, Selection
 from qd.show.view.viewed import ViewedRun, count_endings, open_viewed_run, render_rates
+from sim.rates import rate_labels
 from tests.builders import fresh_values, judged_archive, small_archive
 from tests.qd.recordings import recording_of
 
@@ -57,7 +58,7 @@ def test_causes_are_offered_with_their_numbers_and_rows_say_what_an_elite_is(sho
     assert sum(members.values()) == 10  # those with a goal rate below .5
     assert list(show.causes()) == ["all", *(f"{cause} ({count})" for cause, count in members.items())]
     rows = re.findall(r'data-elite="(\d+)"><b>\1</b> (.*?) <small>', show.render_list(np.array([12, 0]), 12))
-    assert rows == [("12", "crossed, 12 of 20"), ("0", show.ranking.name(0))]
+    assert rows == [("12", "reaches the goal, 12 of 20"), ("0", show.ranking.name(0))]
 
 
 def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way(anymal):
@@ -71,7 +72,7 @@ def test_how_episodes_end_is_a_table_of_who_crosses_and_in_which_way(anymal):
     assert certifier == ("S", 20, {"goal_rate": 10, "collision_rate": 10, "other_rate": 0})
     recorded = count_endings("here", recording_of([1, 2, 3, 2], [6.0] * 4, fallen=[False, True, False, False]))
     assert recorded[1:] == (4, {"goal_rate": 1, "collision_rate": 2, "other_rate": 1, "fallen_rate": 1})
-    table = render_rates([resolved, recorded])
+    table = render_rates([resolved, recorded], rate_labels(show.space.asks))
     assert [re.sub("<.*?>", "|", row).count("%") for row in table.split("</tr>")[1:5]] == [4, 4, 4, 2]
     # Wilson, z^2 = 3.8415, of 9 of 20: .4587 +- .1998
     assert "<b>45%</b> <small>26 to 66%</small>" in table
