@@ -321,9 +321,8 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
     """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped, the first
     to compare with; base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind."""
     out: Path | None = None
-    """File for the numbers. If left out: runs/<robot>-rates.json; with another controller than the shipped one
-    runs/<robot>-<its name>-rates.json; with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of
-    old and new compared.json."""
+    """File for the numbers. If left out: runs/<robot>-rates.json, of another controller <robot>-<its name>-rates.json,
+    with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of old and new compared.json."""
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""

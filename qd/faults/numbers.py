@@ -1,7 +1,4 @@
-"""Faults in numbers and words: what is known of the elites on which a controller fails, and their minimal terrains.
-
-docs/faults.md says what the words mean.
-"""
+"""Faults in numbers, and in the words of docs/faults.md: failing elites, and their minimal terrains."""
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass

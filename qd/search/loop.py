@@ -68,8 +68,8 @@ def start_search(
     terrain_space = space_at(terrain_space, height, ready)
     if terrain_space.asks == Kind.ROUTE:
         ensure_stray(ready, policy, compute)
-    named: Any = {"space": terrain_space.name, "space_sha256": terrain_space.sha256, "likely": likely}
-    return preset(size, ready, policy, **named), ready
+    named: Any = {"space": terrain_space.name, "space_sha256": terrain_space.sha256}
+    return preset(size, ready, policy, likely=likely, **named), ready
 
 
 def search(

@@ -64,10 +64,7 @@ def preset(
     space_sha256: str | None = None,
     likely: Path | None = None,
 ) -> SearchCfg:
-    """Settings of a search by the name of a preset; without ``policy`` of the robot's own controller.
-
-    ``likely`` is the file of :func:`sim.terrains.conditions.likely.choose_likely`.
-    """
+    """Settings of a search by the name of a preset; ``policy`` and ``likely`` are shipped ones if None."""
     known = choose_likely(get_space(space, space_sha256), likely)
     return SearchCfg(
         robot=robot.name,

@@ -41,9 +41,9 @@ class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
     seed: NonNegativeInt = 0
     """Draws their starts."""
     out: Path | None = None
-    """File to write: *.png of a figure, beside which its numbers are written as *.json, *.mp4 or *.gif of a film; with
-    several elites a folder. If left out elite-<number> or minimal-<number> in the run, of a published one in a folder
-    of its own in runs/, and of a map runs/terrains/<map>-<robot>; with another controller -<its name> is added."""
+    """File to write, *.png of a figure (its numbers beside as *.json), *.mp4 or *.gif of a film; with several elites a
+    folder. If left out elite-<number> or minimal-<number> in the run, of a published one in a folder of its own in
+    runs/, of a map runs/terrains/<map>-<robot>; with another controller -<its name> is added."""
 
     def execute(self) -> None:
         """Prints the numbers, writes them and the figures."""
