@@ -22,7 +22,7 @@ from sim.robots.find import get_robot
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayCommand(ControllerFlags, DeviceFlag, EliteFlags):
-    """Cross terrains again: how often robots get over, what it costs them, and a figure with their paths.
+    """Cross terrains again: how often robots pass, what it costs them, and a figure with their paths.
 
     Terrains are elites of a run, numbered by falling (corrected) fitness, or minimal terrains, or a height map of your
     own. `faultline view` and `faultline report` list faults first.
