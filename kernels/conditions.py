@@ -1,10 +1,11 @@
 """Conditions under which robots cross: they vary a robot where its episode begins, and disturb its steps.
 
 A terrain has a row of numbers, the values of all conditions (:mod:`sim.terrains.conditions`). A condition has some
-of three Warp functions, which read their numbers from column ``first`` on:
+of four Warp functions, which read their numbers from column ``first`` on:
 
     begin(robot: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int)
     disturb(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int)
+    drive(step: ForcedStep, row: wp.array[float], first: int, env: int)
     force(step: ForcedStep, row: wp.array[float], first: int, env: int)
 """
 
@@ -97,13 +98,20 @@ class DisturbedStep:
 
 @wp.struct
 class ForcedStep:
-    """A physics step whose forces are found, to add some to: arrays of the solver under its names, a row a world."""
+    """A physics step, to change targets or add forces: arrays of the solver under its names, a row a world."""
 
     memory: Disturbed
     dt: float
     """Length of a physics step [s]."""
     links: wp.array[int]
     """Bodies by their numbers (:func:`sim.robots.compiled.number_links`), shape (2 * LINKS + 1,)."""
+    arm_actuators: wp.array[int]
+    """Actuators of the robot's ``arm_joints``, shape (num_arm_joints,)."""
+    arm_ends: wp.array[int]
+    """Outermost bodies of the arms, shape (num_arms,)."""
+    ctrl: wp.array2d[float]
+    """Joint targets in effect [rad]."""
+    gravity: wp.array[wp.vec3]
     body_rootid: wp.array[int]
     body_isdofancestor: wp.array2d[int]
     """Whether a body moves with a dof, shape (num_bodies, num_dofs)."""
@@ -173,6 +181,21 @@ def make_disturb(effects: Effects) -> Callable[..., None]:
         step.memory.age[env, column] += 1
 
     return disturb
+
+
+@cache
+def make_drive(effects: Effects) -> Callable[..., None]:
+    """What changes the joint targets in effect, before the dynamics find forces by them."""
+    functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
+
+    @kernel_over("step.memory.steps", module="unique")
+    def drive(step: ForcedStep):
+        """Grid (num_envs,)."""
+        env = wp.tid()
+        for k in range(count):
+            wp.static(functions[k])(step, step.memory.row[env], wp.static(firsts[k]), env)
+
+    return drive
 
 
 @cache

@@ -35,7 +35,7 @@ from sim.robots.find import read_stray
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import TerrainBank
 from sim.terrains.spaces.base import TerrainSpace
-from sim.terrains.spaces.registry import check_observed, space_key
+from sim.terrains.spaces.registry import check_conditions, space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
@@ -177,7 +177,7 @@ class Rollout:
         if num_terrains < 1 or replicas < 1 or (num_envs is not None and num_envs < 1):
             got = f"{num_terrains}, {replicas} and {num_envs}"
             raise ValueError(f"num_terrains, replicas and num_envs must be positive, got {got}")
-        check_observed(space.conditions, robot)
+        check_conditions(space.conditions, robot)
         self.robot = robot
         self.cfg = cfg or CrossingCfg()
         self.num_terrains = num_terrains

@@ -39,7 +39,7 @@ from sim.files.command import BEGAN, Interrupted, command_line, say
 from sim.robots.find import get_robot, scaled_by_another
 from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
-from sim.terrains.spaces.registry import at_height, check_observed, is_user_space, load_space, space_at
+from sim.terrains.spaces.registry import at_height, check_conditions, is_user_space, load_space, space_at
 from sim.terrains.terrains import Terrains
 
 
@@ -63,7 +63,7 @@ def start_search(
     if height is not None:
         terrain_space = at_height(terrain_space, height)
     wanted = get_robot(robot)
-    check_observed(terrain_space.conditions, wanted, observed_terms(policy or wanted.policy_file))
+    check_conditions(terrain_space.conditions, wanted, observed_terms(policy or wanted.policy_file))
     ready = ensure_ready(wanted, policy, compute, skip_level_ground=skip_level_ground)
     terrain_space = space_at(terrain_space, height, ready)
     if terrain_space.asks == Kind.ROUTE:

@@ -126,6 +126,8 @@ class EpisodeStates:
         """One physics step of the numbered episodes."""
         self._delayed.append(self.targets.copy())
         controls = self._delayed.popleft()[:, self._joints]
+        for condition, values in self._conditions:
+            controls = condition.drive_plain(self, values, controls, self._steps)
         if self._net is not None:
             controls = self._net.step(controls - self.qpos[:, 7 + self._joints], self.qvel[:, 6 + self._joints])
         for k in running:

@@ -78,6 +78,23 @@ def number_links(robot: RobotCfg) -> NDArray[np.int32]:
     return np.array([*right[::-1], 1, *left], np.int32)
 
 
+def number_arm_actuators(robot: RobotCfg, driven: Sequence[int]) -> list[int]:
+    """Actuators of the robot's ``arm_joints``, where each actuator drives a joint by its index in ``joint_names``."""
+    return [[*driven].index(robot.joint_names.index(name)) for name in robot.arm_joints]
+
+
+@lru_cache(maxsize=8)
+def number_arm_ends(robot: RobotCfg) -> list[int]:
+    """The outermost body of each arm: those of ``arm_joints`` that carry no other one."""
+    model = robot_spec(robot).compile()
+    bodies = {int(model.joint(name).bodyid[0]) for name in robot.arm_joints}
+    carrying = set[int]()
+    for body in bodies:
+        while body := int(model.body_parentid[body]):
+            carrying.add(body)
+    return sorted(bodies - carrying)
+
+
 def touching_geoms(*bodies: Any) -> list[Any]:
     """Geoms of bodies that touch the ground, body by body."""
     return [geom for body in bodies for geom in body.geoms if geom.contype or geom.conaffinity]

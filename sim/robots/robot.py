@@ -79,6 +79,8 @@ class RobotCfg:
     """Whether base collision is a descriptor of its own (the paper: Cassie)."""
     senses: tuple[Literal["pose", "contacts", "torques"], ...] = ()
     """What stands after the scan in the observation row: :data:`kernels.observation` says it."""
+    arm_joints: tuple[str, ...] = ()
+    """Joints of arms, which its controller does not move; the conditions of ``+arms`` do."""
     action_scale: PositiveFloat = 0.5
     """Radians per unit of action."""
     physics_dt: Annotated[float, Meta(gt=0, le=0.05)] = 0.005

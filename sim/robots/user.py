@@ -25,7 +25,7 @@ from sim.robots.probes import make_probes, measure_extents, start_height
 from sim.robots.robot import ROBOTS, RobotCfg, needed_senses
 
 _ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
-_NAMES = (*_ROLES, "joint_names", "penalties", "senses")
+_NAMES = (*_ROLES, "joint_names", "arm_joints", "penalties", "senses")
 _NOT_IN_TOML = ("label", "paper", "settings_file")
 NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
 """What a robot may be called, since files and folders are called after it."""
@@ -112,8 +112,9 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
     point in the default pose; limbs are all others. The default pose is the keyframe ``home`` of the file, else zero or
     the nearest angle that a joint can take. The contact force limit is the weight. The name is that of the folder of
-    ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it, and its
-    terms decide the senses. ``given`` has one value a joint where a setting is of joints.
+    ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it, its terms
+    decide the senses, and joints that it does not move are arm joints. ``given`` has one value a joint where a setting
+    is of joints.
     """
     model = robot_file.model
     nearest = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, *model.jnt_range[1:].T), 0.0).tolist()
@@ -136,12 +137,14 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     reach = np.abs(data.geom_xpos[feet, :2]) + model.geom_rbound[feet, None]  # of the feet from the base
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
     controller = file.with_name("controller.toml")
-    content = read_toml(controller).get("observation", ()) if controller.exists() else ()
-    terms = [term for term in content if isinstance(term, dict)]
+    content = read_toml(controller) if controller.exists() else {}
+    terms = [term for term in content.get("observation", ()) if isinstance(term, dict)]
+    names = joint_names(model)
     scan = next((term for term in terms if term.get("term") == "scan"), {})
     inferred = {
         "name": file.parent.name,
-        "joint_names": list(joint_names(model)),
+        "joint_names": list(names),
+        "arm_joints": [name for name in names if name not in content.get("joints", names)],
         "collision_bit": False,
         "default_joint_pos": pose,
         "penalties": [p.name for p in PENALTIES.values() if p.default and (roles["limb_geoms"] or not p.needs_limbs)],
@@ -161,7 +164,7 @@ def describe_inferred(robot: RobotCfg) -> str:
     if file is None or file.suffix != ".toml":
         return ""
     required = [field.name for field in fields(RobotCfg) if field.default is field.default_factory is MISSING]
-    optional = ("default_base_height", "max_speed", *["senses"][: len(robot.senses)])
+    optional = ["default_base_height", "max_speed", *filter(vars(robot).get, ("senses", "arm_joints"))]
     names = [name for name in (*required, *optional) if name not in read_toml(file)]
     lines = [f"{name} = {to_toml(getattr(robot, name))}" for name in names]
     return "\n  ".join([f"Inferred; what is not right can be set in {file}:", *lines])
@@ -180,7 +183,7 @@ def settings_problems(robot: RobotCfg) -> Iterator[str]:
         yield f"name must be {NEW_NAME}, got {robot.name!r}"
     for field in _NAMES:
         names = getattr(robot, field)
-        if not names and field not in ("limb_geoms", "penalties", "senses"):
+        if not names and field not in ("limb_geoms", "arm_joints", "penalties", "senses"):
             yield f"{field} must name at least one"
         if len({*names}) < len(names):
             yield f"{field} must hold each name once, got {', '.join(names)}"
@@ -189,8 +192,9 @@ def settings_problems(robot: RobotCfg) -> Iterator[str]:
             yield f"a geom has one role: {', '.join(sorted(both))} is in {role} and {other}"
     if not {*robot.penalties} <= {*PENALTIES} or len(robot.penalties) < 2:
         yield f"penalties must be at least 2 of {', '.join(PENALTIES)}, got {', '.join(robot.penalties)}"
-    if missing := [name for name in robot.training.steady_joints if name not in robot.joint_names]:
-        yield f"training.steady_joints: no joint named {', '.join(missing)} in joint_names"
+    for field, names in (("arm_joints", robot.arm_joints), ("training.steady_joints", robot.training.steady_joints)):
+        if missing := [name for name in names if name not in robot.joint_names]:
+            yield f"{field}: no joint named {', '.join(missing)} in joint_names"
     for name, other in (("stiffness", "damping"), ("saturation_effort", "velocity_limit")):
         if (getattr(robot, name) is None) != (getattr(robot, other) is None):
             yield f"{name} and {other} must be given together"

@@ -11,10 +11,14 @@ import pytest
 import warp as wp
 
 from sim.crossing import CrossingCfg
+from sim.mujoco_c.crossing import EpisodeStates
+from sim.mujoco_c.model import Starts, crossing_model
+from sim.robots.compiled import mj, robot_spec
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
+from sim.terrains.conditions.kinds import condition_column, nominal_row
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
 from sim.terrains.terrains import GroundMaps
 from tests.sim.policies import stand
@@ -129,3 +133,55 @@ def crossing(robot, device, policy=stand, num_terrains=1, replicas=4, **cfg):
     robot = dataclasses.replace(robot, max_duration_s=cfg.pop("max_duration_s", 0.6))
     cfg = CrossingCfg(**{"poll_every_s": 0.1} | cfg)
     return Rollout(robot, policy, num_terrains=num_terrains, replicas=replicas, device=device, cfg=cfg)
+
+
+def rows_of(*pushes):
+    """Rows of conditions with some values by their names, the others nominal."""
+    rows = np.tile(nominal_row(), (len(pushes), 1))
+    for row, push in zip(rows, pushes, strict=True):
+        for name, value in push.items():
+            row[condition_column(name)] = value
+    return rows
+
+
+def simulate_under(robot, rows, device="cpu"):
+    """A robot on level ground under each row of conditions."""
+    bank = TerrainBank(len(rows), device=device, with_conditions=True)
+    grounds = dataclasses.replace(GroundMaps.plain(len(rows)), conditions=rows)
+    bank.set_heights(np.tile(FLAT, (len(rows), 1, 1)), ground=grounds)
+    sim = Simulation(robot, bank, np.arange(len(rows)))
+    sim.begin_conditions(wp.ones(len(rows), dtype=int, device=device))
+    return sim
+
+
+def fall(robot, rows, steps, device="cpu"):
+    """Falls from a random state high above ground under each row; yields states after ``steps``, ours and theirs."""
+    rng = np.random.default_rng(0)
+    turn, joints = rng.normal(size=4), robot.default_joint_pos + rng.uniform(-0.1, 0.1, robot.num_joints)
+    states = [4.0, 4.0, 20.0, *turn / np.linalg.norm(turn), *joints], rng.uniform(-1.0, 1.0, 6 + robot.num_joints)
+    joint_q, joint_qd = (np.tile(values, (len(rows), 1)).astype(np.float32) for values in states)
+    sim = simulate_under(robot, rows, device)
+    put(sim, joint_q, joint_qd)
+    com = robot_spec(robot).compile().body_ipos[1]
+    start = Starts.of_newton(joint_q[:1], joint_qd[:1], com)
+    plain = [EpisodeStates(robot, crossing_model(robot, FLAT), start, row.astype(float)) for row in rows]
+    for episodes in plain:
+        episodes.targets[:] = joint_q[:1, 7:]
+    for made in range(1, 1 + steps[-1]):
+        sim.physics_step()
+        for episodes in plain:
+            episodes.step(np.arange(1))
+        if made in steps:
+            qpos, qvel = (np.concatenate([getattr(each, name) for each in plain]) for name in ("qpos", "qvel"))
+            yield Starts.of_newton(positions(sim), velocities(sim), com), Starts(qpos=qpos, qvel=qvel)
+
+
+def mean_velocity(robot, states):
+    """Velocity of the whole robot's mass centre [m/s], shape (num_states, 3)."""
+    model, found = robot_spec(robot).compile(), []
+    data = mj.MjData(model)
+    for data.qpos[:], data.qvel[:] in zip(states.qpos, states.qvel, strict=True):
+        mj.mj_forward(model, data)
+        mj.mj_subtreeVel(model, data)
+        found.append(data.subtree_linvel[1].copy())
+    return np.array(found)

@@ -1,5 +1,5 @@
-"""Conditions under which robots cross, which belong to a terrain: of the robot, pushes, commands, and what it sees."""
+"""Conditions under which robots cross, which belong to a terrain: of robot and arms, pushes, commands, what it sees."""
 
-from sim.terrains.conditions import command, kinds, perception, pushes
+from sim.terrains.conditions import arms, command, kinds, perception, pushes
 
-__all__ = ["command", "kinds", "perception", "pushes"]
+__all__ = ["arms", "command", "kinds", "perception", "pushes"]

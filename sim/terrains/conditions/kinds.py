@@ -68,10 +68,14 @@ class Condition:
     """Warp function that varies a robot where its episode begins (:mod:`kernels.conditions`)."""
     disturb: ClassVar[Any] = None
     """Warp function that disturbs a control step."""
+    drive: ClassVar[Any] = None
+    """Warp function that changes joint targets in a physics step."""
     force: ClassVar[Any] = None
     """Warp function that adds forces in a physics step."""
     observed: ClassVar[str] = ""
     """The only term of an observation (:data:`sim.controllers.described.TERMS`) that it disturbs, if there is one."""
+    needs_arms: ClassVar[bool] = False
+    """Whether it acts on the robot's ``arm_joints``."""
     disturbs_last: ClassVar[bool] = False
     """Whether it disturbs what others have disturbed."""
     moment: str | None = None
@@ -105,6 +109,10 @@ class Condition:
         ``step`` counts physics steps since the episodes began.
         """
         return rows
+
+    def drive_plain(self, episodes: Any, values: Array, targets: Array, step: int) -> Array:
+        """Joint targets in effect in a physics step [rad], shape (num_episodes, num_actuators)."""
+        return targets
 
     def force_plain(self, episodes: Any, values: Array, running: Any, step: int) -> None:
         """Adds to ``xfrc_applied`` of the episodes ``running`` before a physics step; it was 0."""
@@ -149,7 +157,7 @@ def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str
     return [texts[name] for name in names]
 
 
-def condition_effects(stage: Literal["begin", "disturb", "force"]) -> tuple[tuple[Any, int], ...]:
+def condition_effects(stage: Literal["begin", "disturb", "drive", "force"]) -> tuple[tuple[Any, int], ...]:
     """Warp functions of a stage in the order in which they act, each with its first column in a row."""
     columns = sorted(split_row(np.arange(len(nominal_row()))), key=lambda pair: pair[0].disturbs_last)
     return tuple((effect, int(own[0])) for condition, own in columns if (effect := getattr(condition, stage)))

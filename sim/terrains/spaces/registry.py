@@ -244,8 +244,12 @@ def get_space(name: str, sha256: str | None = None) -> TerrainSpace:
     return WiderSpace(space, kinds) if kinds else space
 
 
-def check_observed(conditions: Sequence[str], robot: RobotCfg, terms: Collection[str] | None = None) -> None:
-    """Refuses conditions of what the robot does not sense, or of what a controller with some ``terms`` does not see."""
+def check_conditions(conditions: Sequence[str], robot: RobotCfg, terms: Collection[str] | None = None) -> None:
+    """Refuses conditions of what a robot lacks or does not sense, or a controller with these ``terms`` does not see."""
+    armed = [f"+{name}" for name in conditions if CONDITIONS[name].needs_arms]
+    if armed and not robot.arm_joints:
+        rule = f"robot '{robot.name}' must have arm_joints, on which {', '.join(armed)} act, got none"
+        raise ValueError(f"{rule}: name them in its settings, or leave that out")
     observed = {name: CONDITIONS[name].observed for name in conditions if CONDITIONS[name].observed}
     senses = {"lin_vel", *(["scan"] if robot.scan_x and robot.scan_y else [])}
     for who, has in ((f"robot '{robot.name}'", senses), ("the controller", terms)):

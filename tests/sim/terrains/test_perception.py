@@ -15,7 +15,7 @@ from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank, make_heights
 from sim.terrains.conditions.kinds import CONDITIONS, GROUPS, condition_column, condition_texts, nominal_row
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
-from sim.terrains.spaces.registry import check_observed, get_space, load_space
+from sim.terrains.spaces.registry import check_conditions, get_space, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.qd.stand_in import compute_by
 from tests.sim.dogs import write_toml
@@ -213,10 +213,10 @@ def test_what_a_robot_does_not_see_cannot_be_wrong(anymal, tmp_path):
     blind = dataclasses.replace(anymal, scan_x=(), scan_y=())
     with pytest.raises(ValueError, match=r"robot 'anymal' .* scan.*map_shift, \+map_drift.*leave"):
         Rollout(blind, anymal.policy_file, num_terrains=1, replicas=1, device="cpu", space=get_space("course+map"))
-    check_observed(("push", "estimate"), blind)
-    check_observed(GROUPS["map"], anymal, {"scan"})
+    check_conditions(("push", "estimate"), blind)
+    check_conditions(GROUPS["map"], anymal, {"scan"})
     with pytest.raises(ValueError, match="lin_vel"):
-        check_observed(("estimate",), anymal, {"scan"})
+        check_conditions(("estimate",), anymal, {"scan"})
     with pytest.raises(ValueError, match="scan"):  # before the robot is tried
         start_search(
             str(write_toml(tmp_path / "a")), None, "course+map", size="small", height=None, compute=compute_by(None)

@@ -4,19 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-import warp as wp
 
-from sim.mujoco_c.crossing import EpisodeStates
-from sim.mujoco_c.model import Starts, crossing_model
-from sim.robots.compiled import mj, number_links, robot_spec
+from sim.robots.compiled import number_links, robot_spec
 from sim.robots.find import get_robot
-from sim.simulation import Simulation
-from sim.terrains.bank import TerrainBank
-from sim.terrains.conditions.kinds import CONDITIONS, GROUPS, condition_column, nominal_row
+from sim.terrains.conditions.kinds import CONDITIONS, GROUPS
 from sim.terrains.spaces.registry import load_space
 from sim.terrains.terrains import GroundMaps
 from tests.sim.dogs import write_dog
-from tests.sim.scenes import FLAT, free_body, positions, put, velocities
+from tests.sim.scenes import fall, free_body, mean_velocity, rows_of
 
 SPACE = load_space("super_gaussian+pushes")
 LINKS = 6
@@ -24,55 +19,9 @@ SIZE, BEGIN, STEPS = (0.12, -0.16), 2, 20
 """Of the pushes here [m/s]; the physics step in which they begin, and how many they last."""
 
 
-def rows_of(*pushes):
-    """Rows of conditions with some values by their names, the others nominal."""
-    rows = np.tile(nominal_row(), (len(pushes), 1))
-    for row, push in zip(rows, pushes, strict=True):
-        for name, value in push.items():
-            row[condition_column(name)] = value
-    return rows
-
-
 def push(link, number=1, seconds=BEGIN * 0.005):
     values = {"x": SIZE[0], "y": SIZE[1], "time": seconds, "link": link}
     return {f"push_{number}_{name}": value for name, value in values.items()}
-
-
-def fall(robot, rows, steps, device="cpu"):
-    """Falls from a random state high above ground under each row; yields states after ``steps``, ours and theirs."""
-    rng = np.random.default_rng(0)
-    turn, joints = rng.normal(size=4), robot.default_joint_pos + rng.uniform(-0.1, 0.1, robot.num_joints)
-    states = [4.0, 4.0, 20.0, *turn / np.linalg.norm(turn), *joints], rng.uniform(-1.0, 1.0, 6 + robot.num_joints)
-    joint_q, joint_qd = (np.tile(values, (len(rows), 1)).astype(np.float32) for values in states)
-    bank = TerrainBank(len(rows), device=device, with_conditions=True)
-    grounds = dataclasses.replace(GroundMaps.plain(len(rows)), conditions=rows)
-    bank.set_heights(np.tile(FLAT, (len(rows), 1, 1)), ground=grounds)
-    sim = Simulation(robot, bank, np.arange(len(rows)))
-    put(sim, joint_q, joint_qd)
-    sim.begin_conditions(wp.ones(len(rows), dtype=int, device=device))
-    com = robot_spec(robot).compile().body_ipos[1]
-    start = Starts.of_newton(joint_q[:1], joint_qd[:1], com)
-    plain = [EpisodeStates(robot, crossing_model(robot, FLAT), start, row.astype(float)) for row in rows]
-    for episodes in plain:
-        episodes.targets[:] = joint_q[:1, 7:]
-    for made in range(1, 1 + steps[-1]):
-        sim.physics_step()
-        for episodes in plain:
-            episodes.step(np.arange(1))
-        if made in steps:
-            qpos, qvel = (np.concatenate([getattr(each, name) for each in plain]) for name in ("qpos", "qvel"))
-            yield Starts.of_newton(positions(sim), velocities(sim), com), Starts(qpos=qpos, qvel=qvel)
-
-
-def mean_velocity(robot, states):
-    """Velocity of the whole robot's mass centre [m/s], shape (num_states, 3)."""
-    model, found = robot_spec(robot).compile(), []
-    data = mj.MjData(model)
-    for data.qpos[:], data.qvel[:] in zip(states.qpos, states.qvel, strict=True):
-        mj.mj_forward(model, data)
-        mj.mj_subtreeVel(model, data)
-        found.append(data.subtree_linvel[1].copy())
-    return np.array(found)
 
 
 def test_a_push_on_each_link_is_that_of_mujoco_c(robot, device):
