@@ -34,7 +34,7 @@ from sim.rollout import RolloutResult
 from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.elements.kinds import ELEMENTS
 from sim.terrains.quantities import Quantity, Sweep
-from sim.terrains.spaces.registry import check_observed, load_space
+from sim.terrains.spaces.registry import check_conditions, load_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import ground_genes
 from sim.terrains.terrains import Terrains
@@ -185,7 +185,7 @@ def measure_dose(
     if any(CONDITIONS[name].asks == Kind.ROUTE for name in conditions):
         read_stray(robot)  # or refuses
     for policy in controllers.values():
-        check_observed(conditions, robot, observed_terms(policy))
+        check_conditions(conditions, robot, observed_terms(policy))
         check_policy(policy, robot, compute.device)
     out = out or RUNS / f"{robot.name}-dose" / ("dose-resolved.json" if resolved else "dose.json")
 
