@@ -28,9 +28,9 @@ from sim.terrains.terrains import Terrains
 EPISODES_SEARCHED = 400_000
 _EXAMPLES = 2
 """Of each kind of condition."""
-_OF_ALL = (name for name, kind in CONDITIONS.items() if not (kind.asks or kind.needs_arms))
+_KINDS = [name for name, kind in CONDITIONS.items() if not (kind.asks or kind.needs_arms)]
 SPACES = {
-    "conditions": "+".join((SUPER_GAUSSIAN.name, *_OF_ALL)),
+    "conditions": "+".join((SUPER_GAUSSIAN.name, *_KINDS)),
     "route": f"{SUPER_GAUSSIAN.name}+command+pushes",
 }
 SEEDS = (0, 1, 2)
