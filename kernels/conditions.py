@@ -184,23 +184,11 @@ def make_disturb(effects: Effects) -> Callable[..., None]:
 
 
 @cache
-def make_drive(effects: Effects) -> Callable[..., None]:
-    """What changes the joint targets in effect, before the dynamics find forces by them."""
-    functions, firsts, count = [f for f, _ in effects], [first for _, first in effects], len(effects)
+def make_force(effects: Effects, *, counts: bool = True) -> Callable[..., None]:
+    """What adds forces to those that the dynamics have found, before constraints are solved; it ``counts`` the steps.
 
-    @kernel_over("step.memory.steps", module="unique")
-    def drive(step: ForcedStep):
-        """Grid (num_envs,)."""
-        env = wp.tid()
-        for k in range(count):
-            wp.static(functions[k])(step, step.memory.row[env], wp.static(firsts[k]), env)
-
-    return drive
-
-
-@cache
-def make_force(effects: Effects) -> Callable[..., None]:
-    """What adds forces to those that the dynamics have found, before constraints are solved."""
+    Without, what changes the joint targets in effect, before the dynamics find forces by them.
+    """
 
     @kernel_over("step.memory.steps", module="unique")
     def force(step: ForcedStep):
@@ -208,6 +196,7 @@ def make_force(effects: Effects) -> Callable[..., None]:
         env = wp.tid()
         for k in range(wp.static(len(effects))):
             wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
-        step.memory.steps[env] += 1
+        if wp.static(counts):
+            step.memory.steps[env] += 1
 
     return force

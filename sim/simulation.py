@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from kernels.actuator_net import make_torques
-from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_drive, make_force
+from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_force
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
 from kernels.episode import Episodes, Outcome
@@ -257,12 +257,8 @@ class Simulation:
             Disturbed, self.device, row=rows, age=observed, former=former, steps=self.num_envs, **maps
         )
         self.disturbed.noise = self.make_noise(NoiseCfg())
-        driven = self._coordinates.target_of_actuator.numpy() - 7
-        numbers = {
-            "links": number_links(robot),
-            "arm_actuators": number_arm_actuators(robot, driven),
-            "arm_ends": number_arm_ends(robot),
-        }
+        arms = number_arm_actuators(robot, self._coordinates.target_of_actuator.numpy() - 7)
+        numbers = {"links": number_links(robot), "arm_actuators": arms, "arm_ends": number_arm_ends(robot)}
         arrays = {name: wp.array(values, dtype=int) for name, values in numbers.items()}
         self._forced = self.dynamics.view_forces(memory=self.disturbed, dt=robot.physics_dt, **arrays)
 
@@ -330,7 +326,7 @@ class Simulation:
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
             to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
             if self.disturbed is not None and self.robot.arm_joints:
-                make_drive(condition_effects("drive"))(self._forced)
+                make_force(condition_effects("drive"), counts=False)(self._forced)
             if self._net is not None:
                 self._write_torques(self.joint_q, self.joint_qd, *self._net, coordinates)
             if self.motors is not None:

@@ -4,7 +4,7 @@ The arms are the robot's ``arm_joints``. Targets are shifted before the drives a
 the file's ranges of targets hold as always; a shift grows from 0 in the first second.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -26,28 +26,23 @@ def _shift_arms(step: ForcedStep, env: int, size: float, periods: float, time_s:
         step.ctrl[env, step.arm_actuators[k]] += grown * wp.sin(2.0 * wp.PI * (periods + TURN * float(k)))
 
 
-def _shift_plain(episodes: Any, targets: Array, size: float, periods: float, time_s: float) -> Array:
-    from sim.robots.compiled import number_arm_actuators
-
-    if size == 0.0:
-        return targets
-    arms = number_arm_actuators(episodes.robot, episodes.model.actuator_trnid[:, 0] - 1)
-    phases = 2.0 * np.pi * (periods + float(TURN) * np.arange(len(arms)))
-    targets[:, arms] += size * min(1.0, time_s / float(RISE_S)) * np.sin(phases)
-    return targets
-
-
 @wp.func
 def _drive_hold(step: ForcedStep, row: wp.array[float], first: int, env: int):
     if row[first] != 0.0:
         _shift_arms(step, env, row[first], row[first + 1], float(step.memory.steps[env]) * step.dt)
 
 
+@wp.func
+def _drive_wander(step: ForcedStep, row: wp.array[float], first: int, env: int):
+    if row[first] != 0.0:
+        time_s = float(step.memory.steps[env]) * step.dt
+        _shift_arms(step, env, row[first], time_s / row[first + 1], time_s)
+
+
 class ArmsHold(Condition):
     """How far at most the arm joints are held from where the controller holds them [rad], and in which pattern.
 
-    The pattern, from 0 to 1, is the phase of a sine over the joints: joint k is held off by
-    ``size * sin(2 pi (pattern + 0.618 k))``.
+    Joint k is held off by ``size * sin(2 pi (pattern + 0.618 k))``.
     """
 
     name, cause = "arms_hold", "arms elsewhere"
@@ -59,20 +54,21 @@ class ArmsHold(Condition):
     dose = Sweep("arms_hold", (0.0, 0.2, 0.4, 0.6, 0.8), title="arms held elsewhere")
     needs_arms = True
     drive = _drive_hold
+    swings: ClassVar[bool] = False
 
     def drive_plain(self, episodes: Any, values: Array, targets: Array, step: int) -> Array:
         """Shifts the targets of the arms."""
-        return _shift_plain(episodes, targets, *values, step * episodes.robot.physics_dt)
+        from sim.robots.compiled import number_arm_actuators
+
+        if values[0]:
+            time_s = step * episodes.robot.physics_dt
+            arms = number_arm_actuators(episodes.robot, episodes.model.actuator_trnid[:, 0] - 1)
+            periods = (time_s / values[1] if self.swings else values[1]) + float(TURN) * np.arange(len(arms))
+            targets[:, arms] += values[0] * min(1.0, time_s / float(RISE_S)) * np.sin(2.0 * np.pi * periods)
+        return targets
 
 
-@wp.func
-def _drive_wander(step: ForcedStep, row: wp.array[float], first: int, env: int):
-    if row[first] != 0.0:
-        time_s = float(step.memory.steps[env]) * step.dt
-        _shift_arms(step, env, row[first], time_s / row[first + 1], time_s)
-
-
-class ArmsWander(Condition):
+class ArmsWander(ArmsHold):
     """How far the arm joints swing about where the controller holds them [rad], and the period [s].
 
     Each swings as a sine, joint k 0.618 k of a period ahead of the first.
@@ -83,15 +79,10 @@ class ArmsWander(Condition):
         Gene(name="arms_wander", low=0.0, middle=0.25, high=0.5, absent=-1.0, unit="rad", limits=(0.0, 10.0)),
         Gene(name="arms_period", low=0.5, middle=1.0, high=4.0, unit="s", limits=(0.01, 100.0)),
     )
-    form, least = "arms swinging by {:.2f} rad every {:.1f} s", 0.005
+    form = "arms swinging by {:.2f} rad every {:.1f} s"
     dose = Sweep("arms_wander", (0.0, 0.1, 0.2, 0.3, 0.4, 0.5), title="swinging arms")
-    needs_arms = True
     drive = _drive_wander
-
-    def drive_plain(self, episodes: Any, values: Array, targets: Array, step: int) -> Array:
-        """Shifts the targets of the arms."""
-        time_s = step * episodes.robot.physics_dt
-        return _shift_plain(episodes, targets, values[0], time_s / values[1], time_s)
+    swings = True
 
 
 @wp.func

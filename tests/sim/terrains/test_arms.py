@@ -83,8 +83,8 @@ def test_joints_that_the_controller_beside_it_does_not_move_are_those_of_arms(ar
 def test_arms_move_as_in_mujoco_c(armed, device):
     rows = rows_of({}, *CASES.values())
     for ours, plain in fall(armed, rows, (60, 300), device):  # while a shift grows, and after
-        np.testing.assert_allclose(ours.qpos[:, 7:], plain.qpos[:, 7:], atol=2e-4)
-        np.testing.assert_allclose(ours.qvel[:, 6:], plain.qvel[:, 6:], atol=5e-3)
+        np.testing.assert_allclose(ours.qpos[:, 7:], plain.qpos[:, 7:], atol=5e-6)
+        np.testing.assert_allclose(ours.qvel[:, 6:], plain.qvel[:, 6:], atol=1e-4)
         arms = plain.qpos[:, -4:]
         apart = np.abs(arms[:, None] - arms).max(axis=2) + np.eye(len(rows))
         assert apart.min() > 0.005  # each case is another one
