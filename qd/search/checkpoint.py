@@ -16,7 +16,7 @@ from sim.files.atomic import write_atomically
 
 REMEDY = "put a copy of it back, or start a new run"
 _KIND = b"faultline search checkpoint "
-_MAGIC = _KIND + b"8\n"
+_MAGIC = _KIND + b"9\n"
 _HASH_BYTES = 32
 _ADMITTED = {
     "numpy": ("dtype", "ndarray", "float32", "float64", "int32", "int64"),

@@ -39,7 +39,7 @@ class FitnessCfg:
     lam: float = 2.0
     """Weight of u, the share of episodes without a base collision; u is 0 if none collided."""
     crossed: Share = 0.0
-    """How much less what nobody crosses is worth in the search (:func:`find_worth`)."""
+    """How much less what nobody crosses is worth in the search, a share (:func:`find_worth`)."""
     likely: NonNegativeFloat = 0.0
     """How much less what is unlikely is worth in the search: the power of the likelihood that it is multiplied by."""
     disturbances: dict[str, Disturbance] = field(default_factory=dict)
@@ -190,21 +190,9 @@ def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> 
     return replace(evaluation, fitness=fitness, cell=cells.find_cells(evaluation.ratios, evaluation.collides))
 
 
-def find_worth(fitness: Any, chance: Any, crossed: float, likely_share: Any = None) -> Any:
-    """What terrains are worth in the search: less of their fitness above the floor, the less anybody crosses them.
-
-    ``chance`` is that somebody does, and ``crossed`` the share that is lost where nobody does. ``likely_share`` is what
-    each keeps of the rest, its likelihood to the power :attr:`FitnessCfg.likely`. All are arrays or tensors that fit.
-    """
-    if not crossed and likely_share is None:
-        return fitness
-    share = kept_share(chance, crossed)
-    return FITNESS_FLOOR + (fitness - FITNESS_FLOOR) * (share if likely_share is None else share * likely_share)
-
-
-def kept_share(chance: Any, crossed: float) -> Any:
-    """Share of its worth that a terrain keeps which somebody crosses with that chance."""
-    return 1.0 - crossed * (1.0 - chance)
+def find_worth(fitness: Any, share: Any) -> Any:
+    """What terrains are worth in the search: their ``share`` of the fitness above the floor, or all of it if None."""
+    return fitness if share is None else FITNESS_FLOOR + (fitness - FITNESS_FLOOR) * share
 
 
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:

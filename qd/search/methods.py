@@ -276,8 +276,7 @@ class SurrogateSearch(Method):
         elites: Any = self.archive.data()
         count = len(emitters) * self.batch_size
         chance = self.surrogate.find_chance(elites["genes"], elites["goal_rate"])
-        likely_share = self.surrogate.find_likely_share(elites["genes"])
-        worth = find_worth(elites["objective"], chance, self.surrogate.crossed, likely_share)
+        worth = find_worth(elites["objective"], self.surrogate.find_share(elites["genes"], chance))
         return self.surrogate.propose(count, elites["genes"], elites["index"], worth, pending)
 
     def tell(self, evaluation: Any, rows: Columns, added: Columns, batches: dict[int, slice]) -> None:

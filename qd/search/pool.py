@@ -16,7 +16,6 @@ from qd.search.fitness import (
     Evaluation,
     FitnessCfg,
     join_evaluations,
-    kept_share,
     merge_evaluations,
 )
 
@@ -67,8 +66,7 @@ class Pool:
         solutions: Their unclipped genes, shape (N, num_genes).
         iteration: When each was found, shape (N,).
         number: By which each is known, ascending, shape (N,).
-        chance: That somebody crosses each, as far as the search knows, shape (N,).
-        likely_share: Share of its worth that each keeps by how likely its conditions are, shape (N,).
+        share: Share of its worth that each keeps, less where nobody may cross it, or it is unlikely, shape (N,).
         holds: Whether each held a cell when the cells were settled last, shape (N,).
         labelled: Whether others have tried to cross each, shape (N,).
     """
@@ -80,7 +78,7 @@ class Pool:
         self.iteration, self.number = np.zeros(0, np.int64), np.zeros(0, np.int64)
         self._next_number = 0
         self._crossings = np.zeros(0, np.int64)
-        self.chance, self.likely_share = np.zeros(0), np.zeros(0)
+        self.share = np.zeros(0)
         self.holds, self.labelled = np.zeros(0, bool), np.zeros(0, bool)
 
     def __len__(self) -> int:
@@ -112,9 +110,7 @@ class Pool:
         self.number = np.append(self.number, self._next_number + np.arange(len(new)))
         self._crossings = np.append(self._crossings, np.ones(len(new), np.int64))
         self._next_number += len(new)
-        self.chance, self.likely_share = (
-            np.append(each, np.ones(len(new))) for each in (self.chance, self.likely_share)
-        )
+        self.share = np.append(self.share, np.ones(len(new)))
         self.holds, self.labelled = (np.append(each, np.zeros(len(new), bool)) for each in (self.holds, self.labelled))
         return merged
 
@@ -141,14 +137,13 @@ class Pool:
         self.holds = (rank == 0) & (score > 0.0) & (self.terrains.fitness > FITNESS_FLOOR)
         stays = ((rank < DEPTH) & (score > 0.0)) | np.isin(self.number, pending)
         self.terrains = self.terrains.rows(stays)
-        for name in ("solutions", "iteration", "number", "_crossings", "chance", "likely_share", "holds", "labelled"):
+        for name in ("solutions", "iteration", "number", "_crossings", "share", "holds", "labelled"):
             setattr(self, name, getattr(self, name)[stays])
         return np.flatnonzero(self.holds)
 
     def _find_score(self, terrains: Evaluation) -> NDArray[np.float64]:
-        """What each is expected to add to the QD score; less where nobody may cross it, or it is unlikely."""
-        score = expected_score(terrains, self.cells, self.fitness)
-        return score * kept_share(self.chance, self.fitness.crossed) * self.likely_share
+        """The share that each keeps of what it is expected to add to the QD score."""
+        return expected_score(terrains, self.cells, self.fitness) * self.share
 
 
 def _rank(group: NDArray[np.int64], key: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.int64]:

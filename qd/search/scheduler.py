@@ -128,10 +128,9 @@ class Scheduler:
                 added[name][accepted] = values
         if self._pool is not None and self._pool.terrains is not None:
             if (surrogate := self._surrogate) is not None:
-                genes, goal_rate = clipped(self._pool.solutions), self._pool.terrains.goal_rate
-                self._pool.chance = surrogate.find_chance(genes, goal_rate)
-                if (likely_share := surrogate.find_likely_share(genes)) is not None:
-                    self._pool.likely_share = likely_share
+                genes = clipped(self._pool.solutions)
+                chance = surrogate.find_chance(genes, self._pool.terrains.goal_rate)
+                self._pool.share = surrogate.find_share(genes, chance)
             held = self._pool.settle(self._pending_numbers())  # the archive is made anew, of those that hold the cells
             self._archive.clear()
             if len(held):

@@ -57,11 +57,6 @@ class Prediction(NamedTuple):
         """Shape (MEMBERS, N)."""
         return self.numbers[..., -1].sinh()
 
-    def worth(self, crossed: float, likely_share: NDArray[np.float64] | None = None) -> Tensor:
-        """What terrains are worth in the search, shape (MEMBERS, N); by their likelihood, if given, of shape (N,)."""
-        likely = None if likely_share is None else torch.from_numpy(likely_share).to(self.chance)
-        return find_worth(self.fitness, self.chance, crossed, likely)
-
     @property
     def collided(self) -> Tensor:
         """The collision bit, shape (MEMBERS, N)."""
@@ -105,11 +100,6 @@ class Surrogate:
         return get_space(self.space_name, self.space_sha256)
 
     @property
-    def crossed(self) -> float:
-        """How much less what nobody crosses is worth."""
-        return self.fitness.crossed
-
-    @property
     def _capacity(self) -> int:
         """Terrains that it learns from at most."""
         return min(MAX_TERRAINS, MAX_MAP_BYTES // (self._maps.element_size() * self._maps.shape[1:].numel()))
@@ -139,7 +129,7 @@ class Surrogate:
     @property
     def _labelled(self) -> NDArray[np.int64]:
         """Rows of the terrains of which is known whether anybody crosses them."""
-        return np.flatnonzero(~np.isnan(self._targets[:, -1])) if self.crossed else np.zeros(0, np.int64)
+        return np.flatnonzero(~np.isnan(self._targets[:, -1])) if self.fitness.crossed else np.zeros(0, np.int64)
 
     def learn(
         self, genes: NDArray[np.float32], evaluation: Evaluation, crossed: NDArray[np.bool_] | None = None
@@ -163,7 +153,12 @@ class Surrogate:
                 logarithms = (np.log(values + _MIN_PENALTY) for values in (evaluation.penalty_mean, evaluation.spread))
                 rates = evaluation.goal_rate, evaluation.collision_rate, evaluation.collides
                 labels = np.full(len(valid), np.nan) if crossed is None else crossed.astype(np.float64)
-                columns = [*logarithms, np.arcsinh(evaluation.fitness), *rates, *[labels] * (self.crossed > 0.0)]
+                columns = [
+                    *logarithms,
+                    np.arcsinh(evaluation.fitness),
+                    *rates,
+                    *([labels] if self.fitness.crossed else []),
+                ]
                 targets = np.column_stack([evaluation.ratios, *columns])
                 targets = targets[valid].astype(np.float32).astype(np.float16)
                 # Labels are few: their terrains come anew before they are the oldest ones, which are forgotten.
@@ -229,7 +224,7 @@ class Surrogate:
         loss = loss + ((numbers - true_numbers) ** 2).mean(-1)
         loss = loss + nn.functional.binary_cross_entropy_with_logits(rates, true_rates, reduction="none").mean(-1)
         loss = loss.mean(0).sum()
-        return loss + label_loss(crossed, true_crossed) if self.crossed else loss
+        return loss + label_loss(crossed, true_crossed) if self.fitness.crossed else loss
 
     @torch.inference_mode()
     def predict(self, genes: Tensor) -> Prediction:
@@ -253,17 +248,24 @@ class Surrogate:
                 chance[rows] = predicted.chance.mean(0).cpu().numpy()
         return chance
 
-    def find_likely_share(self, genes: NDArray[np.float32]) -> NDArray[np.float64] | None:
-        """Share of their worth that terrains keep by their conditions, (N, num_genes), shape (N,); None if all do."""
-        fitness = self.fitness
-        if not fitness.likely:
-            return None
-        return np.exp(fitness.likely * find_log_likelihood(self.space.condition_rows(genes), fitness.disturbances))
+    def find_share(self, genes: Any, chance: Any) -> Any:
+        """Share of their worth that terrains keep: less, the less anybody crosses them, and the less likely they are.
+
+        Genes, (N, num_genes), and the ``chance`` that somebody crosses each, (..., N), are arrays or tensors, and so is
+        the share, (..., N); None if all keep all.
+        """
+        cfg = self.fitness
+        share = 1.0 - cfg.crossed * (1.0 - chance) if cfg.crossed else None
+        if not cfg.likely:
+            return share
+        rows = self.space.condition_rows(torch.as_tensor(genes).cpu().numpy())
+        likely = np.exp(cfg.likely * find_log_likelihood(rows, cfg.disturbances))
+        likely = torch.from_numpy(likely).to(chance) if isinstance(chance, Tensor) else likely
+        return likely if share is None else share * likely
 
     def _find_worth(self, prediction: Prediction, genes: Tensor) -> Tensor:
         """What terrains are worth in the search, shape (MEMBERS, N)."""
-        likely_share = self.find_likely_share(genes.cpu().numpy()) if self.fitness.likely else None
-        return prediction.worth(self.crossed, likely_share)
+        return find_worth(prediction.fitness, self.find_share(genes, prediction.chance))
 
     @torch.inference_mode()
     def propose(

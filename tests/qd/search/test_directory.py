@@ -129,7 +129,7 @@ KIND = b"faultline search checkpoint "
 
 def wrap(payload: bytes) -> bytes:
     """A file with a right magic and hash around any payload, as an attacker would make it."""
-    return KIND + b"8\n" + hashlib.sha256(payload).digest() + payload
+    return KIND + b"9\n" + hashlib.sha256(payload).digest() + payload
 
 
 @pytest.mark.parametrize(

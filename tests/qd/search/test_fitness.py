@@ -36,14 +36,11 @@ def test_consistent_terrains_are_not_punished():
     assert fitness == pytest.approx([2.0, 2.0 - 4.0 * 0.75, 2.0 - 4.0 * 0.25, 2.0])
 
 
-def test_what_nobody_may_cross_is_worth_less_by_hand():
-    # Above the floor of -20 are 30, 30 and 8: the share .8 * (1 - chance) is lost, 0, .6 and .8.
-    worth = find_worth(np.array([10.0, 10.0, -12.0]), np.array([1.0, 0.25, 0.0]), 0.8)
+def test_worth_is_a_share_of_what_lies_above_the_floor():
+    worth = find_worth(np.array([10.0, 10.0, -12.0]), np.array([1.0, 0.4, 0.2]))  # 30, 30 and 8 above -20
     assert worth == pytest.approx([10.0, -20.0 + 0.4 * 30.0, -20.0 + 0.2 * 8.0])
     fitness = np.array([0.1, 0.2]) / 3.0
-    assert find_worth(fitness, np.zeros(2), 0.0).tolist() == fitness.tolist()
-    both = find_worth(np.array([10.0, 10.0]), np.array([1.0, 0.0]), 0.8, np.array([0.5, 0.5]))  # 30 above the floor
-    np.testing.assert_allclose(both, [-5.0, -17.0])
+    assert find_worth(fitness, None).tolist() == fitness.tolist()
 
 
 @pytest.mark.parametrize(("num_invalid", "valid"), [(5, True), (6, False), (19, False)])

@@ -214,16 +214,14 @@ def test_a_cell_has_a_few_terrains_and_those_under_way():
     assert len(pool) == DEPTH
 
 
-def test_a_cell_is_held_by_what_somebody_crosses_where_that_counts():
+def test_a_cell_is_held_by_what_keeps_most_of_its_worth():
     both = join_evaluations([crossed((0.25, 0.35, 0.4), total=8.1), crossed((0.25, 0.35, 0.4))])
-    for weight, holder in ((0.0, 0), (0.5, 1)):  # the first is a little fitter, and nobody crosses it
-        pool = Pool(2, THREE, replace(WEIGHTS, crossed=weight))
-        pool.tell(np.zeros((2, 2), np.float32), np.full(2, -1), both, 1)
-        pool.chance = np.array([0.0, 1.0])
+    pool = Pool(2, THREE, WEIGHTS)
+    pool.tell(np.zeros((2, 2), np.float32), np.full(2, -1), both, 1)
+    for share, holder in (([1.0, 1.0], 0), ([0.5, 1.0], 1)):  # the first is a little fitter, and nobody crosses it
+        pool.share = np.array(share)
         assert holders(pool) == {find_cell(0.25, 0.35, 0.4): holder}
-        assert pool.holds.tolist() == [holder == 0, holder == 1] and pool.chance.tolist() == [0.0, 1.0]
-        pool.likely_share = np.array([1.0, 0.01])  # the second is unlikely
-        assert holders(pool) == {find_cell(0.25, 0.35, 0.4): 0} and pool.likely_share.tolist() == [1.0, 0.01]
+        assert pool.holds.tolist() == [holder == 0, holder == 1] and pool.share.tolist() == share
 
 
 def test_an_invalid_terrain_holds_no_cell_and_is_forgotten():

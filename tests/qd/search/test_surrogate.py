@@ -121,8 +121,12 @@ def test_of_terrains_alike_it_proposes_the_likeliest_where_these_are_worth_more(
     assert (propose(disturbances=entries) == usual).all()  # bit for bit
     before, after = (find_log_likelihood(space.condition_rows(genes), entries)[0] for genes in (usual, likely))
     assert before < after and after > -0.2
-    share = make_surrogate(space, worth={"likely": 0.5, "disturbances": entries}).find_likely_share(usual)
-    np.testing.assert_allclose(share, np.exp(0.5 * before))
+    likely_too = {"likely": 0.5, "disturbances": entries}
+    for weight, chance, lost in ((0.0, 0.25, 0.0), (0.8, 0.25, 0.8 * 0.75)):
+        share = make_surrogate(space, weight=weight, worth=likely_too).find_share(usual, np.array([chance]))
+        np.testing.assert_allclose(share, (1.0 - lost) * np.exp(0.5 * before))
+    assert make_surrogate(space, weight=0.8).find_share(usual, np.array([0.25])) == pytest.approx([0.4])
+    assert make_surrogate(space).find_share(usual, np.array([0.25])) is None
 
 
 def trained(maps: torch.Tensor, turned: bool) -> list[torch.Tensor]:
