@@ -152,13 +152,9 @@ class Surrogate:
                 units = np.rint(genes * _GENE_UNITS).astype(np.int16)
                 logarithms = (np.log(values + _MIN_PENALTY) for values in (evaluation.penalty_mean, evaluation.spread))
                 rates = evaluation.goal_rate, evaluation.collision_rate, evaluation.collides
-                labels = np.full(len(valid), np.nan) if crossed is None else crossed.astype(np.float64)
-                columns = [
-                    *logarithms,
-                    np.arcsinh(evaluation.fitness),
-                    *rates,
-                    *([labels] if self.fitness.crossed else []),
-                ]
+                columns = [*logarithms, np.arcsinh(evaluation.fitness), *rates]
+                if self.fitness.crossed:
+                    columns.append(np.full(len(valid), np.nan) if crossed is None else crossed.astype(np.float64))
                 targets = np.column_stack([evaluation.ratios, *columns])
                 targets = targets[valid].astype(np.float32).astype(np.float16)
                 # Labels are few: their terrains come anew before they are the oldest ones, which are forgotten.
