@@ -24,7 +24,7 @@ from qd.show.figures import save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
 from qd.show.replay import ReplaySource, save, source_from_map, source_from_run
 from results.make.common import runs_of_today
-from results.make.docs import PAPER, ROBOTS, least_minimum, read
+from results.make.docs import PAPER, ROBOTS, least_minimum, read, read_robots
 from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
 from sim.robots.find import get_robot
@@ -57,11 +57,10 @@ def take_still(source: ReplaySource, name: str) -> None:
     Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
 
 
-def payload_source() -> ReplaySource | None:
-    """The smallest minimal terrain of the published search under conditions that needs a payload; None without any."""
+def payload_source() -> ReplaySource:
+    """The smallest minimal terrain of the published search under conditions that needs a payload."""
     least = least_minimum("anymal", "payload")
-    if least is None:
-        return None
+    assert least is not None
     return source_from_run(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
 
 
@@ -109,12 +108,9 @@ def draw_growth() -> Figure:
     return figure
 
 
-def draw_left() -> Figure | None:
-    """Groups of failing elites and of faults over the searches that see them, and Chao2; None without left.json."""
-    files = {words: content for robot, words in ROBOTS.items() if (content := read(f"results/{robot}/left.json"))}
-    if not files:
-        print("No results/<robot>/left.json is here: left.png stays as it is.")
-        return None
+def draw_left() -> Figure:
+    """Groups of failing elites and of faults over the searches that see them, and Chao2."""
+    files = read_robots("results/{}/left.json")
     figure = new_figure(12, 6.0)
     grid = figure.subplots(2, len(files), sharex=True, squeeze=False)
     for column, (robot, content) in zip(grid.T, files.items(), strict=True):
@@ -149,8 +145,7 @@ def main() -> None:
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
         save_figure(FOLDER / "growth.png", draw_growth())
-        if (figure := draw_left()) is not None:
-            save_figure(FOLDER / "left.png", figure)
+        save_figure(FOLDER / "left.png", draw_left())
     if "pages" in wanted:
         subprocess.run([sys.executable, "-m", "tests.qd.show.view.browser"], check=True)
 
