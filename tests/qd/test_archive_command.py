@@ -210,7 +210,7 @@ def test_the_last_lines_say_what_stops_the_robot_and_which_commands_come_next(ca
     found = read_archive(Path("a b"))
     count = int((found.goal_rate < 0.5).sum())
     assert count and summary.startswith(f"The robot fails {count} of {len(found)} terrains")
-    assert summary.endswith("as found, not crossed again.")
+    assert summary.endswith("as found, not tried again.")
     number = int(worst.split()[2].rstrip(","))
     assert found.goal_rate[number] == found.goal_rate.min()
     run = "--run 'a b'"
