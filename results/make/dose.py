@@ -6,12 +6,15 @@ from typing import Any
 from qd.evaluate.dose import all_doses, measure_dose, parse_doses
 from results.make.common import parse, published_controllers
 
+TRIED = ("step_up=0.1,0.4", "segment_2=1", "push_1=2", "map_shift=0.2", "map_holes=0.5", "estimate=0.5")
+"""Doses of a trial."""
+
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Lets the base and the published controllers cross every value of every obstacle."""
     script = parse(__doc__, argv, "dose.json")
-    controllers = published_controllers(script)
-    doses = parse_doses(("step_up=0.1,0.4",) if script.small else tuple(all_doses()), ())
+    controllers = {"base": script.policy} if script.small else published_controllers(script)
+    doses = parse_doses(TRIED if script.small else tuple(all_doses()), ())
     size = 1 if script.small else None
     for resolved in (False,) if script.small else (False, True):
         out = script.out.with_stem(f"{script.out.stem}-resolved") if resolved else script.out
