@@ -40,7 +40,9 @@ for robot in "${robots[@]}"; do
   make_file "$folder/dose-resolved.json" dose "$robot"                # 5 min
   make_file "$folder/spaces.json" spaces "$robot"                     # 16 min
   make_file "$folder/conditions.json" conditions "$robot"             # 20 min: six searches, which --parts can share
-  make_file "$folder/map_training.json" map_training "$robot"         # 35 min: eight searches, six trainings
+  if [ "$robot" = anymal ]; then
+    make_file "$folder/map_training.json" map_training "$robot"       # 35 min: eight searches, six trainings
+  fi
   make_file "sim/robots/$robot/pack/pack.json" pack "$robot"          # 2 min
   make_file "$folder/train_speed.json" train_speed "$robot"           # 1 min; with MJLAB results.make.peer too, 3 min
   if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then

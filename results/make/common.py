@@ -207,9 +207,10 @@ def measure_once(script: Script, file: Path, measure: Callable[[], dict[str, Any
     """Numbers of a part with where and when they were made; those that today's sources made are read from the file."""
     made = script.read_so_far(file)
     if not made:
+        prepare_output(file)
         made = {**script.origin, "numbers": measure()}
         write_atomically(file, to_json(made))
-    return {key: made[key] for key in ("commit", "device", "date")} | made["numbers"]
+    return {key: made[key] for key in ("command", "commit", "device", "versions", "date")} | made["numbers"]
 
 
 def is_same_file(first: Path, second: Path) -> bool:

@@ -98,7 +98,7 @@ def search_part(script: Script, name: str, seed: int) -> dict[str, Any]:
         archive, numbers = search_space(script, folder, cfg)
         return {"search_seed": seed, **numbers, **needed_conditions(script, archive, folder)}
 
-    return measure_once(script, script.runs / folder / "needed.json", measure)
+    return measure_once(script, script.runs / f"{folder}.json", measure)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         for measure_name, names in measures.items():
             of_seeds = [mean_over_seeds(name, [row[measure_name].get(name) for row in of_kind]) for name in names]
             means[kind][measure_name] = {key: value for mean in of_seeds for key, value in mean.items()}
-    crossed = {key: crossings[key] for key in ("terrains", "commit", "device", "date")}
+    crossed = {key: value for key, value in crossings.items() if key != "controllers"}
     return script.write({"archive": archive, "crossings": crossed, "controllers": rows, "means": means})
 
 

@@ -99,7 +99,7 @@ def time_iteration(script: Script) -> dict[str, Any]:
     rate = float(np.median([(1.0 - row["idle_share"]) * row["robot_steps"] / row["wall_s"] for row in metrics]))
     rollout = make_rollout(script, len(terrains), cfg.episodes_per_iteration, cfg.replicas)
     crossed = Terrains(genes=terrains, seeds=np.arange(len(terrains)))
-    bare = bare_rates(rollout, crossed, rounds=1 if script.small else 3)
+    bare = bare_rates(rollout, crossed, rounds=1 if script.small else 5)
     return {
         "num_envs": cfg.episodes_per_iteration,
         "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),

@@ -82,7 +82,7 @@ def test_doses_are_the_bases_by_todays_sources(tmp_path):
 def test_a_part_is_measured_once_by_the_same_sources(tmp_path):
     script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/some.json")], "some.json")
     numbers = iter(range(9))
-    first, again, anew = tmp_path / "part.json", tmp_path / "part.json", tmp_path / "old.json"
+    first, again, anew = *2 * [tmp_path / "parts/one.json"], tmp_path / "old.json"
     anew.write_text(json.dumps({**script.origin, "sources_sha256": "0" * 64, "numbers": {"count": 7}}))
     made = [common.measure_once(script, file, lambda: {"count": next(numbers)}) for file in (first, again, anew)]
     assert [part["count"] for part in made] == [0, 0, 1]
