@@ -60,12 +60,15 @@ def train_kind(script: Script, kind: str, seed: int) -> str:
 
 
 def make_crossed_sets(script: Script) -> dict[str, TerrainSet]:
-    """The base's failing elites that no training draws, and random terrains, with errors of the map and without."""
+    """The base's failing elites that no training draws, and random terrains, with errors of the map and without.
+
+    In a trial elites that do not fail are among them, since few are held out.
+    """
     archive = read_archive(script.runs / "map_training/archive")
     held_out = generated_set(archive, len(archive), script.seed)
     count = 2 if script.small else paper_terrains(script.robot.name)
     return {
-        HELD_OUT: held_out.rows(np.flatnonzero(archive.failing[held_out.numbers])),
+        HELD_OUT: held_out.rows(np.flatnonzero(archive.failing[held_out.numbers] | script.small)),
         "hard_random_map": plain_set("hard_random", count, script.seed, get_space(SPACE)),
         "hard_random": plain_set("hard_random", count, script.seed),
         "hand_crafted": plain_set("hand_crafted", count, script.seed),
