@@ -43,7 +43,7 @@ HELD_OUT = "held_out"
 def search_map(script: Script, name: str, episodes: int, seed: int, policy: str | None = None) -> dict[str, Any]:
     """Counts of a search with errors of the map, judged; a trial has enough elites to train on some."""
     cfg = script.search_cfg(episodes=episodes, seed=seed, space=SPACE, policy=policy)
-    if script.small and policy is None:
+    if script.small and name == "archive":
         cfg = replace(cfg, scheduler=replace(cfg.scheduler, batch_size=5))
     _, numbers = search_space(script, f"map_training/{name}", cfg)
     return {"search_seed": seed, **numbers}
