@@ -36,8 +36,6 @@ SEARCH_SEED = 1000
 KINDS = ("with", "without")
 TRAININGS = {f"{kind} {seed}": (kind, seed) for kind in KINDS for seed in SEEDS}
 """Kind and seed of each training."""
-HELD_OUT = "held_out"
-"""The set of the base's failing elites that no training draws."""
 
 
 def search_map(script: Script, name: str, episodes: int, seed: int, policy: str | None = None) -> dict[str, Any]:
@@ -60,15 +58,12 @@ def train_kind(script: Script, kind: str, seed: int) -> str:
 
 
 def make_crossed_sets(script: Script) -> dict[str, TerrainSet]:
-    """The base's failing elites that no training draws, and random terrains, with errors of the map and without.
-
-    In a trial elites that do not fail are among them, since few are held out.
-    """
+    """The base's failing elites that no training draws, and random terrains, with errors of the map and without."""
     archive = read_archive(script.runs / "map_training/archive")
     held_out = generated_set(archive, len(archive), script.seed)
     count = 2 if script.small else paper_terrains(script.robot.name)
     return {
-        HELD_OUT: held_out.rows(np.flatnonzero(archive.failing[held_out.numbers] | script.small)),
+        "held_out": held_out.rows(np.flatnonzero(archive.failing[held_out.numbers] | script.small)),  # few in a trial
         "hard_random_map": plain_set("hard_random", count, script.seed, get_space(SPACE)),
         "hard_random": plain_set("hard_random", count, script.seed),
         "hand_crafted": plain_set("hand_crafted", count, script.seed),
@@ -78,8 +73,7 @@ def make_crossed_sets(script: Script) -> dict[str, TerrainSet]:
 def cross_all(script: Script, trainings: Sequence[str]) -> dict[str, Any]:
     """Mean goal rate of each controller on each set, and how many of its terrains it fails."""
     controllers = {"base": script.policy, **{name: train_kind(script, *TRAININGS[name]) for name in trainings}}
-    sets, episodes = make_crossed_sets(script), 1 if script.small else EPISODES
-    cache = script.runs / "crossings"
+    sets, episodes, cache = make_crossed_sets(script), 1 if script.small else EPISODES, script.runs / "crossings"
     crossed = cross_sets(controllers, sets, robot=script.robot, compute=script.compute, episodes=episodes, cache=cache)
     goal = {name: {by: terrain_rates(result)["goal"] for by, result in row.items()} for name, row in crossed.items()}
     return {
