@@ -6,8 +6,7 @@ from typing import Any
 from qd.evaluate.dose import all_doses, measure_dose, parse_doses
 from results.make.common import parse, published_controllers
 
-TRIED = ("step_up=0.1,0.4", "segment_2=1", "push_1=2", "map_shift=0.2", "map_holes=0.5", "estimate=0.5")
-"""Doses of a trial."""
+TRIED = ("step_up=0.1,0.4", "segment_2=1", "push_1=2", "map_shift=0.2", "estimate=0.5")  # in a trial
 
 
 def main(argv: Sequence[str] | None = None) -> None:
