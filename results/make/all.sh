@@ -27,7 +27,7 @@ for robot in "${robots[@]}"; do
   make_file "$folder/witness.json" witness "$robot"                   # 10 min
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/residual.json" residual "$robot"                 # 6 min
-  make_file "$folder/agreement.json" agreement "$robot"               # 15 min, most of it MuJoCo C on 16 cores
+  make_file "$folder/agreement.json" agreement "$robot"               # 20 min, most of it MuJoCo C on 16 cores
   make_file "$folder/search.json" search "$robot"                     # 70 min: 17 searches
   make_file "$folder/crossed.json" crossed "$robot"                   # 25 min: eight searches
   make_file "$folder/left.json" left "$robot"                         # 1 min: of four of these
@@ -39,19 +39,24 @@ for robot in "${robots[@]}"; do
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU
   make_file "$folder/dose-resolved.json" dose "$robot"                # 5 min
   make_file "$folder/spaces.json" spaces "$robot"                     # 16 min
-  make_file "$folder/conditions.json" conditions "$robot"             # 8 min
+  make_file "$folder/conditions.json" conditions "$robot"             # 20 min: six searches, which --parts can share
+  if [ "$robot" = anymal ]; then
+    make_file "$folder/map_training.json" map_training "$robot"       # 35 min: eight searches, six trainings
+  fi
   make_file "sim/robots/$robot/pack/pack.json" pack "$robot"          # 2 min
   make_file "$folder/train_speed.json" train_speed "$robot"           # 1 min; with MJLAB results.make.peer too, 3 min
   if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
     .venv/bin/torchrun --nproc-per-node 2 -m results.make.train_speed --robot "$robot" # 1 min on two GPUs
     make_file "$folder/scale.json" scale "$robot"                     # 4 min on all GPUs
   fi
-  "$python" -m results.make.speed --robot "$robot"                    # 7 min; what is done is not done again
+  "$python" -m results.make.speed --robot "$robot"                    # 7 min; with BEFORE, a checkout, 6 min more
+  [ -z "${BEFORE:-}" ] || "$python" -m results.make.speed --robot "$robot" --against "$BEFORE"
   "$python" -m results.make.speed --robot "$robot" --device cpu       # 4 min, and to be quoted where two cores are free
 done
 if [ -n "${PUBLIC:-}" ]; then # a folder with published controllers of others, as results/make/public.toml says
   "$python" -m results.make.public "$PUBLIC"                            # 50 min
   "$python" -m results.make.public "$PUBLIC" --films                    # some minutes, no GPU
+  "$python" -m results.make.public "$PUBLIC" --route --only go2-robot-lab # 3 min
   imports=$(ls -td runs/make/*/public | head -1)
   "$python" -m results.make.planted "$imports"/{go2-himloco,lite3-himloco,g1-29-unitree-lab}/robot.toml --seed 1 # 8 min
 fi

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,12 +13,14 @@ import numpy as np
 import warp as wp
 from torch.profiler import ProfilerActivity, profile
 
-from kernels.episode import Outcome, make_episodes
+from kernels.episode import Kind, Outcome, make_episodes
+from kernels.route import follow_routes
+from sim.crossing import CrossingCfg, make_task, make_trail
 from sim.mujoco_c.model import crossing_model
 from sim.rollout import Rollout
 from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
-from sim.terrains.conditions.kinds import condition_column
+from sim.terrains.conditions.kinds import CONDITIONS, GROUPS, condition_column, condition_genes
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 
@@ -129,8 +131,9 @@ def bare_rates(rollout: Rollout, terrains: Terrains, rounds: int) -> dict[str, f
 
     Returns:
         ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and in the
-        motion of the crossings ``ground``, on ground with maps of friction and softness that change nothing, and
-        ``conditions``, under conditions on such ground: noise and lag of observations, and others that change nothing.
+        motion of the crossings ``ground``, on ground with maps of friction and softness that change nothing, and on
+        such ground ``conditions``, under noise and lag of observations, ``all_conditions``, under errors of what robots
+        see, too, and ``route``, with the commands of a route in place of these. Other conditions change nothing.
     """
     sim, robot = rollout.sim, rollout.robot
     segments = record_segments(rollout, terrains)
@@ -138,31 +141,48 @@ def bare_rates(rollout: Rollout, terrains: Terrains, rounds: int) -> dict[str, f
     bank.set_heights(sim.bank.heights.numpy())
     motion = Motion(sim, segments)
     with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
-    motions = (motion, with_maps, motion_under_conditions(sim, segments))
-    seconds = np.median([[each.replay() for each in motions] for _ in range(rounds)], axis=0)  # in turns
-    walking, ground, conditions = (each.robot_steps / float(s) for each, s in zip(motions, seconds, strict=True))
-    standing = standing_rate(rollout, motion, terrains)
-    return {"walking": walking, "standing": standing, "ground": ground, "conditions": conditions}
+    seen = [name for name, condition in CONDITIONS.items() if condition.observed]
+    motions = {
+        "walking": motion,
+        "ground": with_maps,
+        "conditions": motion_under_conditions(sim, segments),
+        "all_conditions": motion_under_conditions(sim, segments, seen),
+        "route": motion_under_conditions(sim, segments, GROUPS["command"], Kind.ROUTE),
+    }
+    seconds = np.median([[each.replay() for each in motions.values()] for _ in range(rounds)], axis=0)  # in turns
+    rates = {name: motion.robot_steps / float(s) for (name, motion), s in zip(motions.items(), seconds, strict=True)}
+    return {**rates, "standing": standing_rate(rollout, motion, terrains)}
 
 
-def motion_under_conditions(sim: Simulation, segments: list[Segment]) -> Motion:
-    """The same motion of robots that have conditions, of which none but noise and lag of what nobody reads acts."""
+def motion_under_conditions(
+    sim: Simulation, segments: list[Segment], names: Sequence[str] = (), asks: Kind = Kind.CROSS
+) -> Motion:
+    """The same motion of robots under noise and lag and some other conditions of what nobody reads or obeys."""
     robot = sim.robot
     bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_conditions=True)
     bank.set_heights(sim.bank.heights.numpy())
     rows = bank.conditions.numpy()
     rows[:, condition_column("noise")] = 1.0
     rows[:, condition_column("lag")] = robot.control_dt
+    for gene in condition_genes(names):
+        rows[:, condition_column(gene.name)] = gene.to_value(0.5)
+    rows[:, -1] = asks
     bank.conditions.assign(rows)
     with wp.ScopedDevice(sim.device):
         varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)
         varied.begin_conditions(wp.ones(sim.num_envs, dtype=int))
-        episodes.outcome.fill_(int(Outcome.RUNNING))
+        for values, value in ((episodes.outcome, Outcome.RUNNING), (episodes.kind, asks), (episodes.steps, 1)):
+            values.fill_(int(value))
+        trail, command = make_trail(sim.num_envs, robot, sim.device), wp.zeros((sim.num_envs, 3), dtype=float)
         nobody = wp.zeros(sim.num_envs, dtype=int)
         observation = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
 
+    task, disturbed = make_task(CrossingCfg(), robot), varied.disturbed
+    assert disturbed is not None
+
     def beside() -> None:
         varied.begin_conditions(nobody)
+        follow_routes(varied.joint_q, disturbed.row, task, robot.control_dt, episodes, trail, command)
         varied.disturb(episodes, robot.physics_dt, observation)
 
     return Motion(varied, segments, beside)

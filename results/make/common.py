@@ -10,7 +10,7 @@ import math
 import re
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,8 @@ class Script:
     """Provenance, robot and controller of the numbers, and ``small`` for a trial."""
     parts: tuple[str, ...] = ()
     """Parts of the work to do; all if empty."""
+    against: Path | None = None
+    """Another checkout to measure beside this one."""
 
     @property
     def policy(self) -> str:
@@ -201,6 +203,16 @@ def origin_of(script: Script, run: Path) -> dict[str, Any]:
     return {key: origin[key] for key in ("commit", "device", "date")}
 
 
+def measure_once(script: Script, file: Path, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Numbers of a part with where and when they were made; those that today's sources made are read from the file."""
+    made = script.read_so_far(file)
+    if not made:
+        prepare_output(file)
+        made = {**script.origin, "numbers": measure()}
+        write_atomically(file, to_json(made))
+    return {key: made[key] for key in ("command", "commit", "device", "versions", "date")} | made["numbers"]
+
+
 def is_same_file(first: Path, second: Path) -> bool:
     """Whether two files exist and are equal."""
     return first.exists() and second.exists() and filecmp.cmp(first, second, shallow=False)
@@ -212,7 +224,13 @@ def file_name(label: str) -> str:
 
 
 def parse(
-    doc: str | None, argv: Sequence[str] | None, file: str, *, published: str = "results", parts: Sequence[str] = ()
+    doc: str | None,
+    argv: Sequence[str] | None,
+    file: str,
+    *,
+    published: str = "results",
+    parts: Sequence[str] = (),
+    against: str = "",
 ) -> Script:
     """Reads the flags of a script, and checks that its file can be written.
 
@@ -222,6 +240,7 @@ def parse(
         file: Name of the file written, in ``<published>/<robot>``.
         published: Folder of published files.
         parts: Values of ``--parts``, for a script that can do a part of its work.
+        against: Help of ``--against``, for a script that can measure another checkout too.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robot", default="anymal")
@@ -231,6 +250,8 @@ def parse(
     parser.add_argument("--out", type=Path, help=f"file to write; {published}/<robot>/{file} if left out")
     if parts:
         parser.add_argument("--parts", nargs="+", choices=parts, help="all if left out; each may run on a GPU")
+    if against:
+        parser.add_argument("--against", type=Path, help=against)
     args = parser.parse_args(argv)
     robot = get_robot(args.robot)
     out = args.out or Path("runs/make/small" if args.small else published) / robot.name / file
@@ -245,6 +266,7 @@ def parse(
         out=out,
         origin={**provenance(device, args.seed), **controller_identity(robot, str(robot.policy_file)), **trial},
         parts=tuple(getattr(args, "parts", None) or ()),
+        against=getattr(args, "against", None),
     )
 
 

@@ -77,7 +77,7 @@ def table(rows: Mapping[str, Any], columns: Mapping[str, Column], *, upright: bo
     lines = [[name, *(cell(row) for cell in cells.values())] for name, row in rows.items()]
     used = [k for k in range(len(cells) + 1) if any(line[k] != NONE for line in lines)]
     lines = [[line[k] for k in used] for line in (["", *cells], *lines)]
-    if upright:
+    if upright and used:
         lines = [list(line) for line in zip(*lines, strict=True)]
     head, *body = ("| " + " | ".join(line) + " |" for line in lines)
     return "\n".join([head, "|---" * len(lines[0]) + "|", *body])
@@ -288,46 +288,79 @@ def methods(robot: str) -> str:
 
 
 def conditions() -> str:
-    """Searches of terrains and conditions, and which of their failing elites need a condition."""
-    rows = {
-        label: {**numbers["archive"], **numbers["conditions"]["needed"], **numbers["conditions"]}
-        for label, numbers in read_robots("results/{}/conditions.json").items()
-    }
+    """First searches of terrains with conditions and of routes, and which of their failing elites need a condition."""
+    rows = {}
+    for (robot, label), name in product(ROBOTS.items(), ("conditions", "route")):
+        if search := first_search(robot, name):
+            rows[f"{label}{', routes' * (name == 'route')}"] = search["needed"] | search
     columns = counts("episodes", "elites", "corrected_elites", "confirmed", "faults_panel", "failing")
     columns["... again, from other starts"] = "failing_again"
     columns["... and crossed under nominal conditions"] = "nominal_passes"
     columns["... and faults by the panel"] = "faults_and_nominal_passes"
-    columns |= {f"... with nominal {kind}": kind for kind in condition_names()}
+    columns |= {f"... with nominal {kind}": kind for row in rows.values() for kind in row["needed"]}
     columns["... with none of these alone"] = "needs_no_single_one"
     return table(rows, columns, upright=True)
 
 
-def condition_names() -> tuple[str, ...]:
-    """The conditions of the published searches."""
-    return tuple(read("results/anymal/conditions.json")["conditions"]["needed"])
+def first_search(robot: str, name: str) -> dict[str, Any]:
+    """Numbers of the published search of terrains with ``conditions``, or of the ``route``; empty if there is none."""
+    numbers = read(f"results/{robot}/conditions.json")
+    if name == "conditions" and numbers:
+        return numbers["archive"] | numbers["conditions"]
+    return next(iter(numbers.get("searches", {}).get(name, ())), {})
 
 
-def least_minimum(robot: str, kind: str) -> dict[str, Any] | None:
+def condition_searches() -> str:
+    """Counts of searches of terrains with conditions and of routes: means over their seeds."""
+    rows = {
+        f"{label}, {name} ({means['seeds']})": means
+        for label, numbers in read_robots("results/{}/conditions.json").items()
+        for name, means in numbers.get("means", {}).items()
+    }
+    names = ("episodes", "elites", "corrected_elites", "failing", "failing_distinct", "confirmed", "faults_panel")
+    return table(rows, counts(*names, "faults_distinct"), upright=True)
+
+
+def least_minimum(robot: str, kind: str, name: str) -> dict[str, Any] | None:
     """The minimal terrain with fewest parts that has a condition, among elites that need this condition alone."""
-    needs = read(f"results/{robot}/conditions.json").get("conditions", {})
-    numbers = {example["elite"] for example in needs.get("examples", ()) if example["needs"] == kind}
-    minima = read(f"results/{robot}/conditions/minimal.json").get("elites", ())
-    part = BUMPS + condition_names().index(kind)
+    search = first_search(robot, name)
+    numbers = {example["elite"] for example in search.get("examples", ()) if example["needs"] == kind}
+    minima = read(f"results/{robot}/{name}/minimal.json").get("elites", ())
+    part = BUMPS + list(search["needed"]).index(kind)
     minima = [minimum for minimum in minima if minimum["elite"] in numbers and part in minimum["bumps"]]
     return min(minima, key=lambda minimum: len(minimum["bumps"]), default=None)
 
 
-def condition_examples() -> str:
-    """ANYmal C's smallest failing terrain that has the condition that its elite needs, for each condition."""
+def condition_examples(name: str = "conditions") -> str:
+    """ANYmal C's smallest failing terrain that has the condition that its elite needs, for each of a search."""
     lines = ["| needs | what is left | under | reach the goal | verdict |", "|---" * 5 + "|"]
-    for kind in condition_names():
-        if (least := least_minimum("anymal", kind)) is not None:
+    for kind in first_search("anymal", name).get("needed", ()):
+        if (least := least_minimum("anymal", kind, name)) is not None:
             bumps = sum(part < BUMPS for part in least["bumps"])
             ground = f"{bumps} bump{'s' * (bumps > 1)}" if bumps else "level ground"
             left = "; ".join(least["words"][bumps:])
             rate_and_verdict = f"{least['goal_rate']:.2f} | {least['verdict']}"
             lines.append(f"| {kind} | {ground} | {left} | {rate_and_verdict} |")
     return "\n".join(lines)
+
+
+def map_training() -> str:
+    """C-G trained with errors of the height map and without, beside the base: what each fails under them."""
+    rows: dict[str, Any] = {}
+    for label, numbers in read_robots("results/{}/map_training.json").items():
+        rows[f"{label}: base"] = numbers["controllers"]["base"] | {
+            "held_out": numbers["crossings"]["terrains"]["held_out"]
+        }
+        for kind, means in numbers["means"].items():
+            rows[f"{label}: C-G {kind} errors of the map ({means['seeds']})"] = means
+    sets = {"held_out": "held out", "hard_random_map": "hard-random with errors", "hard_random": "hard-random"}
+    sets["hand_crafted"] = "hand-crafted"
+    columns: dict[str, Column] = {"failing elites held out": "held_out"}
+    columns["... failing again"] = shown("failing", "held_out", form=".1f")
+    columns |= {f"goal, {label}": shown("goal", name, form=".3f") for name, label in sets.items()}
+    names = ("elites", "failing", "failing_distinct", "confirmed", "faults_panel", "faults_distinct")
+    columns |= {f"searched anew: {label}": shown("search", name) for label, name in counts(*names).items()}
+    return table(rows, columns, upright=True)
 
 
 def hardening() -> str:
@@ -385,6 +418,8 @@ def sizes(robot: str) -> str:
         element = half["element"].replace("_", " ")
         measure = f"{half['parameter']} {half['unit']}".strip()
         obstacle = measure if element == half["parameter"] else f"{element}, {measure}"
+        if "_" in half["element"] and half["element"] == half["parameter"]:  # a condition of several words
+            obstacle = f"{numbers['titles'][half['element']]} [{half['unit']}]"
         rows.setdefault(obstacle, {})[half["controller"]] = format_size(half, numbers["dose"])
     stopping = {name: row for name, row in rows.items() if not all(size.startswith("(") for size in row.values())}
     columns = dict.fromkeys(half["controller"] for half in numbers.get("half", ()))
@@ -425,8 +460,9 @@ def agreement() -> str:
     rows = {
         f"{label}, {name.replace('_', '-')}: {engine}": numbers[name][key]
         for label, numbers in read_robots("results/{}/agreement.json").items()
-        for name in ("hard_random", "elites")
+        for name in ("hard_random", "elites", "routes", "pushes")
         for key, engine in engines.items()
+        if name in numbers
     }
     return table(rows, {"terrains": "terrains", "goal rate": shown("goal_bias", form="+.3f")})
 
@@ -494,6 +530,18 @@ def league() -> str:
     return table(read("results/public.json").get("controllers", {}), columns)
 
 
+def league_routes() -> str:
+    """Searches of routes against public controllers."""
+    columns: dict[str, Column] = {
+        "space": lambda row: row["space"],
+        "off the route by [m]": shown("stray_m", form=".2f"),
+    }
+    names = ("episodes", "elites", "failing", "failing_distinct", "failing_families", "confirmed")
+    columns |= {label: shown("archive", name) for label, name in counts(*names).items()}
+    columns["commonest causes"] = list_causes(3)
+    return table(read("results/public_route.json").get("controllers", {}), columns)
+
+
 def drives() -> str:
     """What stops ANYmal C with gains and with an actuator network, and which of both crosses it with which drive."""
     labels, drives = {"pd": "gains", "net": "network"}, read("results/anymal/drive.json").get("drives", {})
@@ -544,6 +592,9 @@ def speed() -> str:
         "an iteration of preset paper [s]": shown("iteration_s_median", form=".2f"),
         "its physics steps/s [million]": shown("world_steps_per_s", **million),
         "... as a share of contacts and solver alone": shown("bare_physics_ratio", form=".2f"),
+        "... time of its step with all conditions, over that without": shown("all_conditions_step_ratio", form=".3f"),
+        "... with a route": shown("route_step_ratio", form=".3f"),
+        "... robot steps/s without them, over those of the commit before": shown("against", "ratio", form=".3f"),
         "an iteration of preset wide [s]": shown("wide", "surrogate", "iteration_s_median", form=".1f"),
         "... minutes for the paper's episodes at that pace":
             shown("wide", "surrogate", "minutes_per_4m_episodes", form=".1f"),
@@ -599,6 +650,7 @@ TABLES: dict[str, Callable[..., str]] = {
         *(archives, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement),
         *(minimal, packs, league, films, drives, speed, kernels, conditions, condition_examples, differences),
         *(witnesses, witness_curve, crossed, crossed_weights, left),
+        *(condition_searches, map_training, league_routes),
     )
 }
 

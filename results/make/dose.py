@@ -6,14 +6,17 @@ from typing import Any
 from qd.evaluate.dose import all_doses, measure_dose, parse_doses
 from results.make.common import parse, published_controllers
 
+TRIED = ("step_up=0.1,0.4", "segment_2=1", "push_1=2", "map_shift=0.2", "estimate=0.5")  # in a trial
+
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Lets the base and the published controllers cross every value of every obstacle."""
-    script = parse(__doc__, argv, "dose.json")
-    controllers = published_controllers(script)
-    doses = parse_doses(("step_up=0.1,0.4",) if script.small else tuple(all_doses()), ())
+    """Lets the base and the published controllers cross every value of every obstacle; parts are the files."""
+    script = parse(__doc__, argv, "dose.json", parts=("search", "resolved"))
+    controllers = {"base": script.policy} if script.small else published_controllers(script)
+    doses = parse_doses(TRIED if script.small else tuple(all_doses()), ())
     size = 1 if script.small else None
-    for resolved in (False,) if script.small else (False, True):
+    for engine in script.parts or (("search",) if script.small else ("search", "resolved")):
+        resolved = engine == "resolved"
         out = script.out.with_stem(f"{script.out.stem}-resolved") if resolved else script.out
         sizes: dict[str, Any] = {"terrains": size, "episodes": size, "seed": script.seed}
         measure_dose(script.robot, controllers, doses, compute=script.compute, resolved=resolved, out=out, **sizes)

@@ -1,6 +1,7 @@
 """What breaks public controllers, each by one import and one search: results/public.json.
 
 FOLDER holds clones of REPOSITORIES, each under its own name. What a publisher's files do not say is filled in below.
+With ``--route`` each is searched on routes alone: results/public_route.json, 3 minutes a controller.
 """
 
 import argparse
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from kernels.episode import Outcome
-from qd.check import ensure_ready
+from qd.check import ensure_ready, ensure_stray
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
 from qd.evaluate.level import measure_level_ground
@@ -39,7 +40,7 @@ from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import read_toml
 from sim.rates import typical_outcome
-from sim.robots.find import fitting_space, get_robot
+from sim.robots.find import fitting_space, get_robot, read_stray
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
@@ -47,6 +48,8 @@ from sim.terrains.spaces.registry import SUPER_GAUSSIAN, at_height
 CONTROLLERS = LEAGUE["controllers"]
 ITERATIONS = 1
 """Of preset wide, at the height that fits."""
+ROUTE_ITERATIONS = 6
+"""... on routes."""
 ROBOTS_AT_ONCE = 4096
 """On a GPU, where many of these processes run side by side."""
 COMMON_EMITTERS = 20
@@ -182,6 +185,24 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     }
 
 
+def measure_route(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int, small: bool) -> dict[str, Any]:
+    """A search of routes on terrains of the height that fits, with how far the controller may be off a route."""
+    robot = ready(name, folder, runs, compute)
+    ensure_stray(robot, None, compute)
+    space = f"{fitting_space(robot) or SUPER_GAUSSIAN.name}+command"
+    iterations, stages = (1, ("fresh",)) if small else (ROUTE_ITERATIONS, ("fresh", "resolved"))
+    how: dict[str, Any] = {"seed": seed, "small": small, "iterations": iterations, "stages": stages}
+    ranking, counts = search_at(robot, space, runs / f"{name}-route", compute, **how)
+    return {
+        **LEAGUE["repositories"][Path(CONTROLLERS[name]["source"]).parts[0]],
+        "space": space,
+        "stray_m": read_stray(robot),
+        "max_duration_s": robot.max_duration_s,
+        "archive": counts,
+        "causes": {cause: len(rows) for cause, rows in ranking.by_cause().items()},
+    }
+
+
 def draw_film(name: str, runs: Path) -> None:
     """The failure on the minimal terrain of a search, as a GIF of the pages; it needs a renderer and no GPU."""
     opened = open_run(str(runs / name / "robot.toml"), runs / f"{name}-archive")
@@ -209,12 +230,14 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--device", help="a CUDA device if there is one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--films", action="store_true", help="films of searches that are there, and nothing else")
+    parser.add_argument("--route", action="store_true", help="searches of routes, and nothing else")
     parser.add_argument("--small", action="store_true", help="a trial of some minutes; it publishes nothing")
-    parser.add_argument("--out", type=Path, help="file to write; results/public.json if left out")
+    parser.add_argument("--out", type=Path, help="file to write; results/public.json or public_route.json if left out")
     args = parser.parse_args(argv)
     device = resolve_device(args.device)
     compute = Compute(device, num_envs=ROBOTS_AT_ONCE if device.startswith("cuda") else None)
-    out = args.out or (Path("runs/make/small") if args.small else Path("results")) / "public.json"
+    route = "_route" if args.route else ""
+    out = args.out or (Path("runs/make/small") if args.small else Path("results")) / f"public{route}.json"
     runs = out.parent / "public" if args.small else runs_of_today() / "public"
     if args.films:
         for name in args.only:
@@ -228,10 +251,12 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     def read_numbers(file: Path) -> dict[str, Any]:
         return read_alike(file, origin, "sources_sha256", "device", "seed", "small").get("numbers", {})
 
-    files = {name: runs / f"{name}.json" for name in CONTROLLERS}  # one each, since several processes may run
+    files = {name: runs / f"{name}{route}.json" for name in CONTROLLERS}  # one each, since several processes may run
     for name in args.only:
         if not (numbers := read_numbers(files[name])):
-            numbers = measure(name, args.folder.resolve(), runs, compute, seed=args.seed, small=args.small)
+            numbers = (measure_route if route else measure)(
+                name, args.folder.resolve(), runs, compute, seed=args.seed, small=args.small
+            )
         write_atomically(files[name], to_json(origin | {"numbers": numbers}))
         rows = {name: row for name, file in files.items() if (row := read_numbers(file))}
         write_atomically(out, to_json(origin | {"controllers": rows}))

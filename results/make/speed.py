@@ -4,13 +4,17 @@ The timed iterations are those of a real search, from ask to the saved checkpoin
 on the terrains that the search asks for next, with the same number of robots and the same solver. Steps are counted for
 robots in an episode; waiting robots are not computed.
 
-On a GPU it measures everything but ``cpu``, which it measures on a CPU. Each keeps the numbers of the other.
+On a GPU it measures everything but ``cpu``, which it measures on a CPU. Each keeps the numbers of the other. With
+``--against`` it measures nothing but searches of this checkout and of another one in turns, which takes 6 minutes.
 """
 
+import json
+import os
 import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -31,7 +35,7 @@ from qd.workers.compute import Compute
 from qd.workers.crosser import open_pipeline
 from qd.workers.pipeline import PipelineCfg, build_simulator
 from results.make.bare import bare_rates, kernel_shares, standing_rates
-from results.make.common import ONCE, Script, parse
+from results.make.common import ONCE, Script, parse, t_interval
 from sim.robots.robot import RobotCfg
 from sim.rollout import Rollout
 from sim.terrains.spaces.registry import SUPER_GAUSSIAN, load_space
@@ -45,8 +49,23 @@ PROFILED = 22_400
 """Robots whose kernels are timed, as in a search of preset wide."""
 PAPER_EPISODES = 4_000_000
 ITERATION_KEYS = ("iteration_s_median", "bare_physics_ratio", "world_steps_per_s", "ground_step_ratio")
-KEYS = (*ITERATION_KEYS, "conditions_step_ratio", "envs_curve", "wide", "flat", "kernels", "cpu")
+UNDER = ("conditions", "all_conditions", "route")
+"""Bare rates that say what conditions cost."""
+RATIOS = tuple(f"{name}_step_ratio" for name in UNDER)
+KEYS = (*ITERATION_KEYS, *RATIOS, "against", "envs_curve", "wide", "flat", "kernels", "cpu")
 """Keys that readers expect: null until measured."""
+ROUNDS, TIMED = 4, 8
+"""Searches of each checkout that are timed in turns, and iterations of each."""
+TIME_CHECKOUT = """
+import json, sys
+from results.make import common, speed
+script = common.parse(None, sys.argv[2:], "speed.json")
+cfg = script.search_cfg() if script.small else speed.preset("paper", script.robot)
+metrics, _ = speed.time_search(script, "against", cfg, int(sys.argv[1]))
+rates = [(1.0 - row["idle_share"]) * row["robot_steps"] / row["wall_s"] for row in metrics]
+print(json.dumps([script.origin["sources_sha256"], float(speed.np.median(rates))]))
+"""
+"""What each checkout runs, by functions that both have: a search without conditions."""
 
 
 def time_search(script: Script, name: str, cfg: SearchCfg, iterations: int) -> tuple[Metrics, NDArray[np.float32]]:
@@ -72,14 +91,15 @@ def make_rollout(script: Script, num_terrains: int, num_envs: int, replicas: int
 def time_iteration(script: Script) -> dict[str, Any]:
     """The paper's iteration, and bare physics on the same crossings.
 
-    ``conditions_step_ratio`` is the time of a search's step with conditions over that of one without.
+    ``conditions_step_ratio`` is the time of a search's step with noise and lag over that of one without conditions;
+    ``all_conditions_step_ratio`` with errors of what is seen too, ``route_step_ratio`` with a route's commands.
     """
     cfg = script.search_cfg() if script.small else preset("paper", script.robot)
     metrics, terrains = time_search(script, "iteration", cfg, 1 if script.small else 10)
     rate = float(np.median([(1.0 - row["idle_share"]) * row["robot_steps"] / row["wall_s"] for row in metrics]))
     rollout = make_rollout(script, len(terrains), cfg.episodes_per_iteration, cfg.replicas)
     crossed = Terrains(genes=terrains, seeds=np.arange(len(terrains)))
-    bare = bare_rates(rollout, crossed, rounds=1 if script.small else 3)
+    bare = bare_rates(rollout, crossed, rounds=1 if script.small else 5)
     return {
         "num_envs": cfg.episodes_per_iteration,
         "iteration_s_median": float(np.median([row["wall_s"] for row in metrics])),
@@ -91,8 +111,28 @@ def time_iteration(script: Script) -> dict[str, Any]:
         "bare_physics_ratio": rate / bare["walking"],
         "bare_physics_ratio_standing": rate / bare["standing"],
         "ground_step_ratio": bare["walking"] / bare["ground"],
-        "conditions_step_ratio": 1.0 + rate * (1.0 / bare["conditions"] - 1.0 / bare["ground"]),
+        **{f"{name}_step_ratio": 1.0 + rate * (1.0 / bare[name] - 1.0 / bare["ground"]) for name in UNDER},
     }
+
+
+def time_against(script: Script) -> dict[str, Any]:
+    """Robot steps a second of searches without conditions, here over another checkout: ``ratio`` of the medians.
+
+    The interval is that of the mean of the rounds' ratios.
+    """
+    rounds, iterations = (1, 1) if script.small else (ROUNDS, TIMED)
+    flags = ["--robot", script.robot.name, "--device", script.device, *["--small"] * script.small]
+    rates, sources = np.zeros((rounds, 2)), ["", ""]
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-c", TIME_CHECKOUT, str(iterations), *flags, "--out", f"{folder}/speed.json"]
+        for turn in range(rounds):
+            for column, checkout in enumerate((Path.cwd(), Path(script.against or ".").resolve())):
+                how: Any = {"cwd": checkout, "env": os.environ | {"PYTHONPATH": str(checkout)}}
+                done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, **how)
+                sources[column], rates[turn, column] = json.loads(done.stdout.splitlines()[-1])
+    here, there = np.median(rates, axis=0).tolist()
+    of_rounds = {"rates": rates.tolist(), "ratio_interval": t_interval(rates[:, 0] / rates[:, 1])}
+    return {"against": {"sources_sha256": sources, "ratio": here / there, **of_rounds}}
 
 
 def time_wide(script: Script) -> dict[str, Any]:
@@ -225,19 +265,21 @@ IN_TRIAL = ("curve", "iteration", "flat")
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     """Measures all that the device can, beside the numbers of the other kind of device."""
-    script = parse(__doc__, argv, "speed.json")
+    help_against = "folder of another checkout, whose searches alone are measured beside this one's"
+    script = parse(__doc__, argv, "speed.json", parts=tuple(ON_GPU), against=help_against)
     on_cpu = script.device == "cpu" and not script.small
     parts = {"cpu": time_cpu} if on_cpu else ON_GPU
-    if script.small:
-        parts = {name: ON_GPU[name] for name in IN_TRIAL}
+    if script.against is not None:
+        parts = {"against": time_against}
+    elif script.parts or script.small:
+        parts = {name: ON_GPU[name] for name in script.parts or IN_TRIAL}
     numbers: dict[str, Any] = {}
     for measure in parts.values():
         numbers |= measure(script)
     stored = script.read_so_far(script.out)
-    measured = {name: part for name, part in stored.get("measured", {}).items() if (name == "cpu") != on_cpu}
     origin = {name: script.origin[name] for name in ("commit", "device", "date")}
-    measured |= {name: origin for name in parts}
-    report: dict[str, Any] = script.origin | stored if on_cpu else {"cpu": stored.get("cpu"), **script.origin}
+    measured = stored.get("measured", {}) | {name: origin for name in parts}
+    report: dict[str, Any] = script.origin | stored if on_cpu else stored | script.origin
     report = dict.fromkeys(KEYS) | report | numbers | {"measured": measured}
     return script.add(report, training_rates(script, report["device"]))
 

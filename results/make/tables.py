@@ -37,10 +37,10 @@ TRAININGS |= {f"tables_paper_sizes: {name}": ("tables_paper_sizes", name, SEEDS[
 
 
 def train(script: Script, cfg: FinetuneCfg, kind: str, seed: int, run: Path) -> str:
-    """File of a controller of a kind that a fine-tuning makes, of the published archive if it needs one."""
+    """File of a controller of a kind that a fine-tuning makes, of the published archive unless ``cfg`` has one."""
     cfg = replace(cfg, mix=MIXES[kind], seed=seed)
     if cfg.mix == "generated":
-        cfg = replace(cfg, archive=(str(script.results / "archive"),))
+        cfg = replace(cfg, archive=cfg.archive or (str(script.results / "archive"),))
     policy = run / "policy.pt"
     record = read_made(policy.with_suffix(".train.json"))
     made_here = record.get("sources_sha256") == script.origin["sources_sha256"] and policy.exists()

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,8 +27,8 @@ from tests.qd.stand_in import Stub, make_result, result_of
 
 MAKE = Path(common.__file__).parent
 SCRIPTS = (
-    "agreement", "base", "conditions", "crossed", "dose", "left", "minimal", "pack", "penalty_ratios", "search",
-    "search_noise", "spaces", "speed", "tables", "witness",
+    "agreement", "base", "conditions", "crossed", "dose", "left", "map_training", "minimal", "pack", "penalty_ratios",
+    "search", "search_noise", "spaces", "speed", "tables", "witness",
 )  # fmt: skip
 """Those that call all that the others call."""
 FILES = {name: f"{name}.json" for name in SCRIPTS} | {"minimal": "archive/minimal.json", "pack": "pack/pack.json"}
@@ -78,6 +79,18 @@ def test_doses_are_the_bases_by_todays_sources(tmp_path):
         script.read_dose(conditions=True)
 
 
+def test_a_part_is_measured_once_by_the_same_sources(tmp_path):
+    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/some.json")], "some.json")
+    numbers = iter(range(9))
+    first, again, anew = *2 * [tmp_path / "parts/one.json"], tmp_path / "old.json"
+    anew.write_text(json.dumps({**script.origin, "sources_sha256": "0" * 64, "numbers": {"count": 7}}))
+    made = [common.measure_once(script, file, lambda: {"count": next(numbers)}) for file in (first, again, anew)]
+    assert [part["count"] for part in made] == [0, 0, 1]
+    assert {key: made[1][key] for key in ("commit", "device")} == {
+        key: script.origin[key] for key in ("commit", "device")
+    }
+
+
 def test_what_is_published_goes_with_its_archive(tmp_path):
     """What lies beside another archive is taken away; beside the same one it stays."""
     script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "anymal/base.json")], "base.json")
@@ -119,6 +132,24 @@ def test_training_rates_are_of_the_same_device(tmp_path):
     assert [rates[f"train_env_steps_per_s{key}"] for key in ("", "_8192", "_mjlab")] == [7.0, None, 2.0]
     file.write_text(json.dumps({**script.origin, "rows": rows, "sources_sha256": "0" * 64}))
     assert speed.training_rates(script, "cuda:0")["train_env_steps_per_s"] is None
+
+
+def test_two_checkouts_are_timed_in_turns(tmp_path, monkeypatch):
+    """Medians 11 and 10 of 10, 11, 11, 20 and 10, 10, 10, 40; the rounds' ratios are 1, 1.1, 1.1 and .5."""
+    other = tmp_path / "other"
+    rates = {Path.cwd(): iter((10, 11, 11, 20)), other: iter((10, 10, 10, 40))}
+
+    def run(command, *, cwd, env, **how):
+        assert env["PYTHONPATH"] == str(cwd) and "--against" not in command
+        return SimpleNamespace(stdout=f"compiling\n{json.dumps([cwd.name, next(rates[cwd])])}\n")
+
+    monkeypatch.setattr(speed, "subprocess", SimpleNamespace(run=run, PIPE=None))
+    flags = ["--device", "cpu", "--out", str(tmp_path / "speed.json"), "--against", str(other)]
+    numbers = speed.time_against(common.parse(None, flags, "speed.json", against="help"))["against"]
+    assert numbers["ratio"] == 1.1 and numbers["sources_sha256"] == [Path.cwd().name, "other"]
+    assert numbers["rates"] == [[10, 10], [11, 10], [11, 10], [20, 40]]
+    low, high = numbers["ratio_interval"]
+    assert low + high == pytest.approx(2 * (1 + 1.1 + 1.1 + 0.5) / 4) and low < 0.5
 
 
 def test_a_file_is_not_written_if_the_sources_changed_or_it_cannot_be(tmp_path, monkeypatch):
@@ -207,6 +238,15 @@ def test_agreement_with_mujoco_c_has_the_difference_of_each_terrain_crossed_ther
     assert [numbers[name]["terrains"] for name in ("again", "mujoco_c")] == [3, 2]
 
 
+def test_routes_and_pushes_are_hard_random_of_their_own_spaces(tmp_path):
+    script = common.parse(None, ["--device", "cpu", "--out", str(tmp_path / "agreement.json")], "agreement.json")
+    sets = {name: agreement.draw_set(script, name) for name in agreement.IN_MUJOCO_C}
+    assert [len(genes) for genes, _ in sets.values()] == [300, 150, 40, 40]
+    assert [space for _, space in sets.values()][2:] == ["super_gaussian+command", "super_gaussian+pushes"]
+    heights = [genes[:, :64] for genes, _ in sets.values()]
+    assert not any((heights[0][0] == others[0]).all() for others in heights[1:]) and heights[2].std() > 0.5
+
+
 def test_differences_are_of_the_later_kind_minus_the_earlier():
     rates = {"C-HR": np.full(24, 0.75), "C-G": np.full(24, 0.52), "C-G@1": np.full(24, 0.5)}
     [(pair, row)] = tables.differences_of(rates, np.arange(24), 0).items()
@@ -276,9 +316,46 @@ def test_tables_of_searches_have_a_sign_where_they_are_differences(monkeypatch):
     assert docs.left().splitlines()[2] == "| Dog, failing, distance 1 | 6 | 2 | 4 | 6 (4 to 9) |"
 
 
+def test_tables_of_conditions_have_both_searches(monkeypatch):
+    def search(kinds, **counts):
+        return counts | {"needed": kinds, "nominal_passes": 5, "examples": [{"elite": 3, "needs": "push_1"}]}
+
+    whole = search({"lag": 4}, failing_again=6)
+    numbers = {"archive": {"episodes": 70, "failing": 9}, "conditions": whole, "searches": {"conditions": [whole]}}
+    numbers["searches"]["route"] = [search({"segment_1": 1, "push_1": 2}, episodes=80, failing=8)]
+    numbers["means"] = {"route": {"seeds": 3, "failing": 8.4, "failing_interval": [7.0, 9.0]}}
+    minimum = {"elite": 3, "bumps": [2, 9], "words": ["bump", "pushed"], "goal_rate": 0.25, "verdict": "fault"}
+    files = {"results/anymal/conditions.json": numbers, "results/anymal/route/minimal.json": {"elites": [minimum]}}
+    monkeypatch.setattr(docs, "read", lambda file: files.get(file, {}))
+    lines = docs.conditions().splitlines()
+    assert lines[0] == "|  | ANYmal C | ANYmal C, routes |"
+    wanted = ("| failing | 9 | 8 |", "| ... with nominal lag | 4 | - |", "| ... with nominal push_1 | - | 2 |")
+    assert [line for line in wanted if line not in lines] == []
+    assert docs.condition_searches().splitlines()[-1] == "| failing | 8 (7 to 9) |"
+    assert docs.condition_examples("route").splitlines()[2:] == ["| push_1 | 1 bump | pushed | 0.25 | fault |"]
+    assert len(docs.condition_examples().splitlines()) == 2
+
+
+def test_the_table_of_trainings_with_errors_of_the_map_has_the_base_and_means(monkeypatch):
+    base = {"failing": {"held_out": 9}, "goal": {"hard_random": 0.5}, "search": {"failing_distinct": 100}}
+    interval = {"failing_distinct": 40.0, "failing_distinct_interval": [30.0, 50.0]}
+    means = {"seeds": 3, "failing": {"held_out": 4.5}, "goal": {"hard_random": 0.75}, "search": interval}
+    numbers = {"controllers": {"base": base}, "means": {"with": means}, "crossings": {"terrains": {"held_out": 12}}}
+    monkeypatch.setattr(docs, "read_robots", lambda file: {"Dog": numbers})
+    assert docs.map_training().splitlines() == [
+        "|  | Dog: base | Dog: C-G with errors of the map (3) |",
+        "|---|---|---|",
+        "| failing elites held out | 12 | - |",
+        "| ... failing again | 9.0 | 4.5 |",
+        "| goal, hard-random | 0.500 | 0.750 |",
+        "| searched anew: failing distinct | 100 | 40 (30 to 50) |",
+    ]
+
+
 def test_a_table_without_its_file_is_empty(monkeypatch):
     monkeypatch.setattr(docs, "read", lambda file: {})
     tables = (docs.witnesses, docs.witness_curve, docs.crossed, docs.crossed_weights, docs.left, docs.league)
+    tables += (docs.conditions, docs.condition_searches, docs.map_training, docs.league_routes)
     assert {make() for make in tables} == {docs.table({}, {})}
 
 
