@@ -29,13 +29,6 @@ from sim.terrains.terrains import Terrains
 LINE_M, BESIDE_M = 0.5, 1.0
 """A way is on the line, or beside it, where the robot is never further from the straight line [m]."""
 _LINE_EPISODES = 5  # of a terrain, to see how far plain crossings are from the line
-_SPEED_STD, _OFFSET_STD, _HEADING_STD = 0.3, 0.4, 0.5  # of the first generation [m/s, m, rad]
-_FREE_OFFSET = 4.0  # times as much where no limit holds
-_STEP = 0.7  # how far the distribution moves toward that of the best samples, as a share
-_COMMON = 0.5  # share of the variance that all segments of a sample have in common
-_SMOOTH = 1.5  # reach of the correlation of the rest [segments]
-_MARGIN_M = 0.05  # by which ways stay within the limit [m]
-_BEYOND_COST = 20.0  # of a metre beyond that, where a metre that is missing to the goal costs 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +39,24 @@ class SteerCfg:
     samples: int = EPISODES
     best: int = 5
     """Samples that the next generation is drawn near."""
+    step: float = 0.7
+    """How far the distribution moves toward that of the best samples, as a share."""
+    speed_std: float = 0.3
+    """Of the first generation [m/s]."""
+    offset_std: float = 0.4
+    """[m]; four times as much where no limit holds."""
+    heading_std: float = 0.5
+    """[rad]"""
     least_std: float = 0.05
-    """Least deviation of speed [m/s], offset [m] and heading [rad] in any generation."""
+    """Of any generation, of all three."""
+    common: float = 0.5
+    """Share of the variance that all segments of a sample have in common."""
+    smooth: float = 1.5
+    """Reach of the correlation of the rest [segments]."""
+    margin_m: float = 0.05
+    """By which ways stay within the limit [m]."""
+    beyond_cost: float = 20.0
+    """Of a metre beyond that, where a metre that is missing to the goal costs 1."""
 
     @property
     def seeds(self) -> int:
@@ -113,25 +122,25 @@ def find_ways(
 
     Where ``limit_m`` is not None, ways stay so near to the straight line [m].
     """
-    mean, std, limits = first_ways(len(terrains), crosser.robot, policy, limit_m)
+    mean, std, limits = first_ways(len(terrains), crosser.robot, policy, limit_m, cfg)
     with Bar(label, cfg.generations) as bar:
         for generation in range(cfg.generations):
             ways = draw_ways(mean, std, limits, rng, cfg)
             drawn, move = seeds[:, generation], bar.within(generation, 1.0)
             result = cross_ways(crosser, policy, terrains, ways, drawn, label=label, progress=move)
-            score = score_ways(result, crosser.robot.max_duration_s, limit_m)
+            score = score_ways(result, crosser.robot.max_duration_s, limit_m, cfg)
             mean, std = move_to_best(mean, std, ways, score, cfg)
     return mean.astype(np.float32)
 
 
 def first_ways(
-    count: int, robot: RobotCfg, policy: str, limit_m: float | None
+    count: int, robot: RobotCfg, policy: str, limit_m: float | None, cfg: SteerCfg
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
     """Mean and deviation of the first ways on so many terrains, (count, SEGMENTS, 3), and limits of ways, (2, 3)."""
     shape = (count, SEGMENTS, len(STEERING))
     mean = np.zeros(shape)
-    offset_std = _OFFSET_STD if limit_m is not None else _FREE_OFFSET * _OFFSET_STD
-    std = np.broadcast_to([_SPEED_STD, offset_std, _HEADING_STD], shape).copy()
+    offset_std = cfg.offset_std if limit_m is not None else 4.0 * cfg.offset_std
+    std = np.broadcast_to([cfg.speed_std, offset_std, cfg.heading_std], shape).copy()
     offset = limit_m or CrossingCfg.goal[1]
     speeds = CrossingCfg.lowest_command[0], find_highest_command(CrossingCfg(), robot)[0]
     slowest, fastest = np.clip(speeds, *read_speed_limits(policy))  # what its description limits it is not told
@@ -145,14 +154,14 @@ def draw_ways(
 ) -> NDArray[np.floating]:  # fmt: skip
     """Samples of a generation on T terrains, shape (T, samples, SEGMENTS, 3), by the columns of :func:`first_ways`."""
     noise = rng.standard_normal((len(mean), cfg.samples, *mean.shape[1:]))
-    mixed = np.einsum("kl,tslc->tskc", mix_segments(SEGMENTS), noise)
+    mixed = np.einsum("kl,tslc->tskc", mix_segments(SEGMENTS, cfg), noise)
     return np.clip(mean[:, None] + std[:, None] * mixed, *limits)
 
 
-def mix_segments(count: int) -> NDArray[np.floating]:
+def mix_segments(count: int, cfg: SteerCfg) -> NDArray[np.floating]:
     """What makes independent noise of segments correlated noise, shape (count, count)."""
     apart = np.subtract.outer(np.arange(count), np.arange(count))
-    covariance = _COMMON + (1.0 - _COMMON) * np.exp(-0.5 * (apart / _SMOOTH) ** 2)
+    covariance = cfg.common + (1.0 - cfg.common) * np.exp(-0.5 * (apart / cfg.smooth) ** 2)
     return np.linalg.cholesky(covariance + 1e-6 * np.eye(count))
 
 
@@ -167,11 +176,11 @@ def move_to_best(
     order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
     best = np.take_along_axis(samples, order.reshape(*order.shape, *[1] * (mean.ndim - 1)), axis=1)
     arrives = (score.max(axis=1) > 0.0).reshape(-1, *[1] * (mean.ndim - 1))  # else it is drawn as widely
-    narrower = np.where(arrives, std + _STEP * (best.std(axis=1) - std), std)
-    return mean + _STEP * (best.mean(axis=1) - mean), np.maximum(narrower, cfg.least_std)
+    narrower = np.where(arrives, std + cfg.step * (best.std(axis=1) - std), std)
+    return mean + cfg.step * (best.mean(axis=1) - mean), np.maximum(narrower, cfg.least_std)
 
 
-def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None) -> NDArray[np.float64]:
+def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
     """How good the way of each episode is, shape (T, R): to the goal, and soon; else far ahead; within the limit.
 
     ``longest_s`` is the time after which a crossing ends [s]. A way that leads to the goal has more than 0.
@@ -180,7 +189,7 @@ def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None) -
     soon = 10.0 - 2.0 * result.duration_s / longest_s
     score = np.where(result.reached_goal, soon, -missing - result.base_collision)
     if limit_m is not None:
-        score = score - _BEYOND_COST * np.maximum(result.deviation - (limit_m - _MARGIN_M), 0.0)
+        score = score - cfg.beyond_cost * np.maximum(result.deviation - (limit_m - cfg.margin_m), 0.0)
     return np.where(result.invalid, -np.inf, score)
 
 

@@ -91,7 +91,7 @@ class Labeller(ExitStack):
                 crossed[left] = 2 * result.reached_goal.sum(axis=1) >= EPISODES
             else:
                 steer = SteerCfg(samples=WAYS)
-                ways = draw_ways(*first_ways(len(left), self._robot, self._policy, LINE_M), rng, steer)
+                ways = draw_ways(*first_ways(len(left), self._robot, self._policy, LINE_M, steer), rng, steer)
                 result = cross_ways(crosser, self._policy, terrains[left], ways, seeds[left], **how)
                 crossed[left] = result.reached_goal.any(axis=1)
             counts["label_episodes"] += result.outcome.size

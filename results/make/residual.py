@@ -149,14 +149,14 @@ def seek_offsets(
     mean[:, -1], std[:, -1] = FIRST_HZ, STD_HZ
     low, high = np.full(size + 1, -LARGEST), np.full(size + 1, LARGEST)
     low[-1], high[-1] = LOWEST_HZ, HIGHEST_HZ
-    mix, crossed, curve = mix_segments(KNOTS), np.zeros(count, bool), list[dict[str, float]]()
+    mix, crossed, curve = mix_segments(KNOTS, cfg), np.zeros(count, bool), list[dict[str, float]]()
     for generation in range(cfg.generations):
         noise = rng.standard_normal((count, cfg.samples, size + 1))
         knots = noise[..., :-1].reshape(count, cfg.samples, *shape)
         noise[..., :-1] = np.einsum("kl,tsclj->tsckj", mix, knots).reshape(count, cfg.samples, size)
         samples = np.clip(mean[:, None] + std[:, None] * noise, low, high)
         result = cross(samples, seeds[:, generation])
-        mean, std = move_to_best(mean, std, samples, score_ways(result, robot.max_duration_s, limit_m), cfg)
+        mean, std = move_to_best(mean, std, samples, score_ways(result, robot.max_duration_s, limit_m, cfg), cfg)
         goal = result.reached_goal & (result.deviation <= limit_m)
         crossed |= goal.any(axis=1)
         shares = {"crossed": crossed, "half": goal.mean(axis=1) >= FAILING_GOAL_RATE, "goal": goal}

@@ -123,7 +123,7 @@ def test_the_plain_command_as_a_way_is_no_witness():
 
 def test_a_slow_robot_that_arrives_has_a_better_way_than_one_that_does_not():
     result = result_of([[Outcome.GOAL, Outcome.GOAL, Outcome.TIME_OUT]], duration_s=[[130.0, 90.0, 150.0]])
-    late, soon, never = score_ways(result, 150.0, None)[0]
+    late, soon, never = score_ways(result, 150.0, None, SteerCfg())[0]
     assert soon > late > 0.0 > never
 
 
