@@ -96,10 +96,8 @@ def test_certified_terrains_stand_apart_with_who_certifies_them(certified):
     chosen_by = {"base": "searched", "C-G": "certifier"}
     about = {"terrains": 2, "certifiers": {"C-G": 2, "S": 0}, "chosen_by": chosen_by}
     assert certified["certified"] == {"generated": about}
-    differences = certified["differences"]["generated"]
-    pairs = {pair: about["mended"]["terrains"] for pair, about in differences.items() if " -> " in pair}
+    pairs = {pair: about["mended"]["terrains"] for pair, about in certified["differences"]["generated"].items()}
     assert pairs == {"base -> C-G": [11, 13], "base -> S": [11, 12, 13], "C-G -> S": [12]}
-    assert differences["S - C-G"]["goal"] == (1.0 + 0.5) / 4 and differences["S - C-G"]["seeds"] == [1, 1]
 
 
 def test_a_terrain_is_failed_below_half():
