@@ -58,7 +58,7 @@ window.faultline = (() => {
     [data-elite] { cursor: pointer; padding: 2px 6px; border-radius: 3px; }
     .faultline-list { max-height: 30dvh; overflow-y: auto; margin-top: 4px; }
     .faultline-rates { width: 100%; border-collapse: collapse; }
-    .faultline-rates th, .faultline-rates td { text-align: left; font-weight: normal; padding: 2px 6px; line-height: 1.15;
+    .faultline-rates th, .faultline-rates td { text-align: left; font-weight: normal; padding: 2px 3px; line-height: 1.15;
       white-space: nowrap; }
     .faultline-rates small { display: block; color: #868e96; }
     .faultline-rates tr + tr { border-top: 1px solid var(--mantine-color-default-border, #ddd); }
