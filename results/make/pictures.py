@@ -59,7 +59,7 @@ def take_still(source: ReplaySource, name: str) -> None:
 
 def payload_source() -> ReplaySource:
     """The smallest minimal terrain of the published search under conditions that needs a payload."""
-    least = least_minimum("anymal", "payload")
+    least = least_minimum("anymal", "payload", "conditions")
     assert least is not None
     return source_from_run(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
 
