@@ -22,7 +22,7 @@ from qd.evaluate.sets import TerrainSet, generated_set, paper_terrains, plain_se
 from qd.faults.numbers import EPISODES
 from qd.search.archive import read_archive
 from qd.search.fitness import FAILING_GOAL_RATE
-from results.make.common import COUNTS, SEEDS, Script, mean_over_seeds, measure_once, parse
+from results.make.common import COUNTS, SEEDS, Script, mean_counts, measure_once, parse
 from results.make.spaces import search_space
 from results.make.tables import SIZES, train
 from sim.terrains.spaces.registry import get_space
@@ -118,8 +118,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
         measures = {"search": COUNTS, **dict.fromkeys(("goal", "failing"), crossings["terrains"])}
         means[kind] = {"seeds": len(of_kind)}
         for measure_name, names in measures.items():
-            of_seeds = [mean_over_seeds(name, [row[measure_name].get(name) for row in of_kind]) for name in names]
-            means[kind][measure_name] = {key: value for mean in of_seeds for key, value in mean.items()}
+            means[kind][measure_name] = mean_counts([row[measure_name] for row in of_kind], tuple(names))
     crossed = {key: value for key, value in crossings.items() if key != "controllers"}
     return script.write({"archive": archive, "crossings": crossed, "controllers": rows, "means": means})
 

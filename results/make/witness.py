@@ -21,8 +21,7 @@ from qd.search.archive import WITNESSES, Archive, read_archive
 from qd.search.directory import RunDirectory
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
-from results.make.common import ARCHIVE_FILES, Script, parse
-from sim.files.atomic import to_json, write_atomically
+from results.make.common import ARCHIVE_FILES, Script, measure_once, parse
 from sim.terrains.terrains import Terrains
 
 ARCHIVES = ("archive", "archive_cma_mae")
@@ -38,14 +37,15 @@ _COUNTS = (
 def judge_steered(script: Script, name: str) -> dict[str, Any]:
     """Numbers of an archive with its witnesses, judged in a copy of the published run, which it replaces."""
     run = script.runs / "witness" / name
-    numbers = script.read_so_far(run / "witness.json")
-    if not numbers:
+
+    def steer() -> dict[str, float]:
         if not run.exists():
             shutil.copytree(script.results / name, run)
         began = time.perf_counter()
         judge(run, stages=("steered",), compute=script.compute, most_steered=2 if script.small else None)
-        numbers = {**script.origin, "wall_s": time.perf_counter() - began}
-        write_atomically(run / "witness.json", to_json(numbers))
+        return {"wall_s": time.perf_counter() - began}
+
+    made = measure_once(script, script.runs / "witness" / f"{name}.json", steer)
     archive, by_walker = read_archive(run), {}
     if not script.small:
         script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
@@ -58,7 +58,6 @@ def judge_steered(script: Script, name: str) -> dict[str, Any]:
         kinds = witnesses.kind[witnesses.walker == walker]
         by_walker[walker] = {word: int((kinds == kind).sum()) for kind, word in _KINDS}
     families = np.unique(archive.family[archive.is_fault & archive.certified_by_controllers])
-    made = {key: numbers[key] for key in ("commit", "device", "date", "wall_s")}
     counts = {count: summary.get(count) for count in _COUNTS}
     return counts | {"fault_families_controllers": len(families), "by_walker": by_walker} | made
 
