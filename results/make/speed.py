@@ -127,7 +127,8 @@ def time_against(script: Script) -> dict[str, Any]:
         command = [sys.executable, "-c", TIME_CHECKOUT, str(iterations), *flags, "--out", f"{folder}/speed.json"]
         for turn in range(rounds):
             for column, checkout in enumerate((Path.cwd(), Path(script.against or ".").resolve())):
-                how: Any = {"cwd": checkout, "env": os.environ | {"PYTHONPATH": str(checkout)}}
+                first = os.pathsep.join([str(checkout), os.environ.get("PYTHONPATH", "")])
+                how: Any = {"cwd": checkout, "env": os.environ | {"PYTHONPATH": first}}
                 done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, **how)
                 sources[column], rates[turn, column] = json.loads(done.stdout.splitlines()[-1])
     here, there = np.median(rates, axis=0).tolist()
