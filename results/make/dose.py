@@ -13,7 +13,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Lets the base and the published controllers cross every value of every obstacle; parts are the files."""
     script = parse(__doc__, argv, "dose.json", parts=("search", "resolved"))
     controllers = {"base": script.policy} if script.small else published_controllers(script)
-    doses = parse_doses(TRIED if script.small else tuple(all_doses()), ())
+    borne = tuple(name for name in all_doses() if script.robot.arm_joints or not name.startswith("arms"))
+    doses = parse_doses(TRIED if script.small else borne, ())
     size = 1 if script.small else None
     for engine in script.parts or (("search",) if script.small else ("search", "resolved")):
         resolved = engine == "resolved"
