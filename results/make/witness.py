@@ -11,6 +11,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -101,22 +102,26 @@ def elites_to_steer(archive: Archive, rows: np.ndarray, seed: int, times: int) -
     return Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=archive.terrain_space), seeds
 
 
-def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Judges, and measures what luck finds and how much search pays."""
-    script = parse(__doc__, argv, "witness.json", parts=(*ARCHIVES, "measure"))
-    archives = ARCHIVES[: 1 if script.small else None]
-    judged = {name: judge_steered(script, name) for name in archives if name in (script.parts or archives)}
-    if script.parts and "measure" not in script.parts:
-        return judged
-    judged |= {name: judge_steered(script, name) for name in archives if name not in judged}
+def measure(script: Script) -> dict[str, Any]:
+    """What luck finds among the terrains of the published archive that were steered, and how much search pays."""
     archive = read_archive(script.runs / "witness" / ARCHIVES[0])
     assert archive.witnesses is not None
     tried = np.flatnonzero(archive.witnesses.walker != "")
     some = np.random.default_rng(script.seed).permutation(tried)[: 2 if script.small else CURVE_TERRAINS]
     with Crosser(script.robot, script.compute) as crosser:
         control = measure_control(script, crosser, archive, tried)
-        curve = measure_curve(script, crosser, archive, np.sort(some))
-    return script.write({"archives": judged, "control": control, "curve": curve})
+        return {"control": control, "curve": measure_curve(script, crosser, archive, np.sort(some))}
+
+
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Judges, and measures; parts are archives alone, and ``measure``, which needs the first of them steered."""
+    script = parse(__doc__, argv, "witness.json", parts=(*ARCHIVES, "measure"))
+    parts = script.parts or (*ARCHIVES[: 1 if script.small else None], "measure")
+    judged = {name: judge_steered(script, name) for name in parts if name in ARCHIVES}
+    measured: dict[str, Any] = {}
+    if "measure" in parts:
+        measured = measure_once(script, script.runs / "witness" / "measure.json", partial(measure, script))
+    return judged | measured if script.parts else script.write({"archives": judged, **measured})
 
 
 if __name__ == "__main__":
