@@ -4,6 +4,7 @@ Episodes follow from the run's seed and from what names an elite. Crossings are 
 was stopped finds them when it is run again.
 """
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -454,13 +455,13 @@ def judge(
         for index, name in enumerate(stages):
             STAGES[name].check(archive, judging, stages[:index])
         for number, name in enumerate(stages, 1):
-            step = f"{number} of {len(stages)}: "
+            step, began = f"{number} of {len(stages)}: ", time.perf_counter()
             archive = STAGES[name].run(archive, replace(judging, step=step, most_steered=most_steered))
-            _write(archive, judging, name)
+            _write(archive, judging, name, time.perf_counter() - began)
     return archive
 
 
-def _write(archive: Archive, judging: Judging, stage: str) -> None:
+def _write(archive: Archive, judging: Judging, stage: str, wall_s: float) -> None:
     run = RunDirectory(judging.search.run)
     assert archive.fresh is not None
     file = run.path / SUMMARY_FILE
@@ -472,7 +473,7 @@ def _write(archive: Archive, judging: Judging, stage: str) -> None:
     search = judging.search
     numbers |= fresh_numbers(archive, archive.fresh)
     numbers |= judged_numbers(archive, search.space, search.cfg.fitness.disturbances)
-    numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin}
+    numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin | {"wall_s": wall_s}}
     write_archive(run.path, archive)
     write_atomically(file, to_json(numbers))
     if metrics:

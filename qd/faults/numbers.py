@@ -88,7 +88,8 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
     failing, families = archive.failing, archive.family
     names = archive.certifiers
     parts = ("faults", "faults_panel", "faults_controllers", "faults_witness")
-    counts = ("confirmed", "certified", *parts, "fault_families", "strong", "faults_fdr")
+    kinds = ("fault_families", "fault_families_controllers")
+    counts = ("confirmed", "certified", *parts, *kinds, "strong", "faults_fdr")
     numbers: dict[str, Any] = {
         "failing": None if archive.fresh is None else int(failing.sum()),
         **dict.fromkeys(counts, 0 if archive.fresh is not None and not failing.any() else None),
@@ -115,7 +116,8 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
     if (witnesses := archive.witnesses) is not None:
         tried = witnesses.walker != ""
         found = {name: int((witnesses.kind == kind).sum()) for kind, name in enumerate(WITNESSES) if name}
-        numbers["witnesses"] = {"tried": int(tried.sum()), **found, "limit_m": witnesses.limit_m}
+        own = int((witnesses.on_line & (witnesses.walker == SEARCHED)).sum())
+        numbers["witnesses"] = {"tried": int(tried.sum()), **found, "own_line": own, "limit_m": witnesses.limit_m}
     if names or witnesses is not None:
         numbers["certified"] = int(archive.certified.sum())
     if (names or witnesses is not None) and resolved.any():
@@ -129,6 +131,7 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
         numbers["faults_fdr"] = int((is_fault & find_significant(archive)).sum())
         if families is not None:
             numbers["fault_families"] = len(np.unique(families[is_fault]))
+            numbers["fault_families_controllers"] = len(np.unique(families[is_fault & by_controllers]))
         if archive.varied is not None:
             numbers["crossed_varied"] = int((is_fault & archive.varied.searched.any(axis=1)).sum())
             numbers["robust"] = int(archive.robust.sum())

@@ -101,8 +101,8 @@ def rate_table(rows: Mapping[str, tuple[str, str, str]], *, short: bool = False)
     return table(rows, {name: partial(rate, controller=name, short=short) for name in CONTROLLERS})
 
 
-def archives() -> str:
-    """Counts of the published searches, beside the paper's."""
+def archives(kind: str = "") -> str:
+    """Counts of the published searches, beside the paper's; fewer of the ``short`` kind."""
     rows, paper = {}, read(PAPER)
     for (robot, label), name in product(ROBOTS.items(), ("archive", "archive_cma_mae")):
         rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = read(f"results/{robot}/{name}/archive.json")
@@ -113,7 +113,7 @@ def archives() -> str:
         some = {"": crossed, "strong: ": crossed["strong"]} if crossed else {}
         return "; ".join(f"{label}{held['hold']} of {held['tried']}" for label, held in some.items()) or NONE
 
-    columns = {
+    columns: dict[str, Column] = {
         "episodes": "episodes",
         "*elites*: terrains, each the hardest of its kind": "elites",
         "... that are in their cell again, in fresh episodes": "elites_same_cell",
@@ -134,20 +134,25 @@ def archives() -> str:
         "families of all faults": "fault_families",
         "*distinct* faults": "faults_distinct",
     }
+    if kind == "short":
+        several = ("families", "failing_families", "elites_same_cell", "faults_fdr", "strong", "robust")
+        columns = {name: column for name, column in columns.items() if column not in several}
     return table({name: numbers for name, numbers in rows.items() if numbers}, columns, upright=True)
 
 
 def witnesses() -> str:
     """Witnesses of the published archives, and how many plain crossings find by luck."""
-    rows = {}
-    for label, numbers in read_robots("results/{}/witness.json").items():
-        for name, judged in numbers["archives"].items():
-            rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = judged | judged["witnesses"]
-        rows[f"{label}, plain crossings in their place"] = numbers["control"]
+    rows: dict[str, dict[str, Any]] = {}
+    for robot, label in ROBOTS.items():
+        for name in ("archive", "archive_cma_mae"):
+            if found := (judged := read(f"results/{robot}/{name}/archive.json")).get("witnesses"):
+                rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = judged | found | judged["judged_by"]["steered"]
+        if numbers := read(f"results/{robot}/witness.json"):
+            rows[f"{label}, plain crossings in their place"] = numbers["control"]
     columns: dict[str, Column] = {
         "tried": "tried",
         "witnesses on the line": "line",
-        "... of the searched controller": shown("by_walker", "searched", "line"),
+        "... of the searched controller": "own_line",
         "beside it": "beside",
         "around": "around",
         "faults by controllers": "faults_controllers",

@@ -1,17 +1,13 @@
-"""Witnesses of the published archives, and what MuJoCo C says of faults: results/<robot>/witness.json.
+"""Ways by which robots cross what nobody crosses unsteered, and what MuJoCo C says of faults: witness.json.
 
-The archives are judged on by the stage steered, whose time is ``wall_s``, and that of the default search by mujoco_c,
-too. Each is a part of its own, which is not done again; the part ``measure`` follows them.
-
-``control`` are plain crossings in place of steered ones: how many would pass for witnesses by luck. ``curve`` says how
-many of some terrains a search crosses in half of 20 coarse episodes, over the episodes that it spends on each.
+The published archives are judged by the stages steered and mujoco_c, unless they are. ``control`` are plain crossings
+in place of steered ones: how many would pass for witnesses by luck. ``curve`` says how many of some terrains a search
+crosses in half of 20 coarse episodes, over the episodes that it spends on each.
 """
 
 import shutil
-import time
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,48 +15,31 @@ import numpy as np
 from qd.faults.judge import elite_seeds, judge
 from qd.faults.steer import SteerCfg, cross_half, find_kinds, find_ways, try_ways
 from qd.search.archive import WITNESSES, Archive, read_archive
-from qd.search.directory import RunDirectory
 from qd.workers.crosser import Crosser
 from qd.workers.seeds import Stream
-from results.make.common import ARCHIVE_FILES, Script, measure_once, parse
+from results.make.common import ARCHIVE_FILES, Script, parse
 from sim.terrains.terrains import Terrains
 
-ARCHIVES = ("archive", "archive_cma_mae")
-_KINDS = [(kind, word) for kind, word in enumerate(WITNESSES) if word]
+ARCHIVES = {"archive": ("steered", "mujoco_c"), "archive_cma_mae": ("steered",)}
+"""Stages by which each archive is judged; a fault takes MuJoCo C 20 s of a core."""
 GENERATIONS = (1, 2, 4, 8, 12, 16, 24)
 CURVE_TERRAINS = 200
-_COUNTS = (
-    "failing", "confirmed", "certified", "faults", "faults_panel", "faults_controllers", "faults_witness",
-    "fault_families", "faults_distinct", "failing_families", "failing_distinct", "witnesses", "faults_mujoco_c",
-)  # fmt: skip
 
 
-def judge_steered(script: Script, name: str) -> dict[str, Any]:
-    """Numbers of an archive with its witnesses, judged in a copy of the published run, which it replaces."""
+def judge_steered(script: Script, name: str) -> Archive:
+    """A published archive, judged in a copy of its run, which it replaces, by the stages that are not done."""
     run = script.runs / "witness" / name
-
-    def steer() -> dict[str, float]:
-        if not run.exists():
-            shutil.copytree(script.results / name, run)
-        began = time.perf_counter()
-        judge(run, stages=("steered",), compute=script.compute, most_steered=2 if script.small else None)
-        return {"wall_s": time.perf_counter() - began}
-
-    made = measure_once(script, script.runs / "witness" / f"{name}.json", steer)
-    archive, by_walker = read_archive(run), {}
-    if not script.small:
-        script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
-        if archive.mujoco_c is None and name == ARCHIVES[0]:  # a fault takes 20 s of a core
-            archive = judge(run, stages=("mujoco_c",), compute=script.compute)
-            script.publish(run, script.results / name, (*ARCHIVE_FILES, "*.png"))
-    summary, witnesses = RunDirectory(run).read_summary(), archive.witnesses
-    assert witnesses is not None and archive.family is not None
-    for walker in np.unique(witnesses.walker[witnesses.kind > 0]).tolist():
-        kinds = witnesses.kind[witnesses.walker == walker]
-        by_walker[walker] = {word: int((kinds == kind).sum()) for kind, word in _KINDS}
-    families = np.unique(archive.family[archive.is_fault & archive.certified_by_controllers])
-    counts = {count: summary.get(count) for count in _COUNTS}
-    return counts | {"fault_families_controllers": len(families), "by_walker": by_walker} | made
+    if not run.exists():
+        shutil.copytree(script.results / name, run)
+    archive = read_archive(run)
+    done = {"steered": archive.witnesses, "mujoco_c": archive.mujoco_c}
+    for stage in ARCHIVES[name][: 1 if script.small else None]:
+        if done[stage] is None:
+            few = 2 if script.small else None
+            archive = judge(run, stages=(stage,), compute=script.compute, most_steered=few)
+            if not script.small:
+                script.publish(run, script.results / name, ARCHIVE_FILES)
+    return archive
 
 
 def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np.ndarray) -> dict[str, Any]:
@@ -76,7 +55,7 @@ def measure_control(script: Script, crosser: Crosser, archive: Archive, rows: np
             how: Any = {"label": "control", "engine": engine}
             counts[:, kind, side] = try_ways(crosser, script.policy, terrains, way, drawn, limit_m, **how)
     found = find_kinds(counts)
-    return {"tried": len(rows)} | {word: int((found == kind).sum()) for kind, word in _KINDS}
+    return {"tried": len(rows)} | {word: int((found == kind).sum()) for kind, word in enumerate(WITNESSES) if word}
 
 
 def measure_curve(script: Script, crosser: Crosser, archive: Archive, rows: np.ndarray) -> list[dict[str, Any]]:
@@ -102,26 +81,21 @@ def elites_to_steer(archive: Archive, rows: np.ndarray, seed: int, times: int) -
     return Terrains(genes=archive.genes[rows], seeds=seeds[:, 0], space=archive.terrain_space), seeds
 
 
-def measure(script: Script) -> dict[str, Any]:
-    """What luck finds among the terrains of the published archive that were steered, and how much search pays."""
-    archive = read_archive(script.runs / "witness" / ARCHIVES[0])
+def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
+    """Judges the archives, or those that ``--parts`` names, and measures if it has judged all."""
+    script = parse(__doc__, argv, "witness.json", parts=tuple(ARCHIVES))
+    names = script.parts or tuple(ARCHIVES)[: 1 if script.small else None]
+    judged = {name: judge_steered(script, name) for name in names}
+    if script.parts:
+        return {}
+    archive = judged["archive"]
     assert archive.witnesses is not None
     tried = np.flatnonzero(archive.witnesses.walker != "")
     some = np.random.default_rng(script.seed).permutation(tried)[: 2 if script.small else CURVE_TERRAINS]
     with Crosser(script.robot, script.compute) as crosser:
         control = measure_control(script, crosser, archive, tried)
-        return {"control": control, "curve": measure_curve(script, crosser, archive, np.sort(some))}
-
-
-def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Judges, and measures; parts are archives alone, and ``measure``, which needs the first of them steered."""
-    script = parse(__doc__, argv, "witness.json", parts=(*ARCHIVES, "measure"))
-    parts = script.parts or (*ARCHIVES[: 1 if script.small else None], "measure")
-    judged = {name: judge_steered(script, name) for name in parts if name in ARCHIVES}
-    measured: dict[str, Any] = {}
-    if "measure" in parts:
-        measured = measure_once(script, script.runs / "witness" / "measure.json", partial(measure, script))
-    return judged | measured if script.parts else script.write({"archives": judged, **measured})
+        curve = measure_curve(script, crosser, archive, np.sort(some))
+    return script.write({"control": control, "curve": curve})
 
 
 if __name__ == "__main__":

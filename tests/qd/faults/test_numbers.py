@@ -286,7 +286,7 @@ def test_faults_by_ways_stand_beside_those_by_controllers():
     names = ("certified", "faults", "faults_panel", "faults_controllers", "faults_witness", "strong")
     assert pick_numbers(archive, *names) == (3, 2, 1, 1, 1, 0)
     (witnesses,) = pick_numbers(archive, "witnesses")
-    assert witnesses == {"tried": 2, "around": 1, "beside": 0, "line": 1, "limit_m": 0.5}
+    assert witnesses == {"tried": 2, "around": 1, "beside": 0, "line": 1, "own_line": 1, "limit_m": 0.5}
     sentences = [describe_judgement(archive, number)[-2:] for number in (1, 3)]
     assert sentences[0][0] == "It is a fault: it can be crossed on the line."
     assert sentences[0][1] == "Steered, at 0.5 m/s, this controller crosses it on the line, 17 of 20."
