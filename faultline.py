@@ -1,7 +1,7 @@
 """The command ``faultline``, and its functions for Python; only what a command or a function needs is loaded.
 
 ``faultline.search``, ``judge``, ``evaluate`` and ``finetune`` do what the commands of these names do, ``cross`` lets a
-controller cross terrains; docs/searching.md shows them in twenty lines.
+controller cross terrains; docs/searching.md shows them in twenty lines. ``gate`` tests one beside its training.
 """
 
 import difflib
@@ -41,6 +41,7 @@ Each has the module of its flags, where ``archive`` is the dataclass ``ArchiveCo
 
 if TYPE_CHECKING:
     from qd.evaluate.evaluate import evaluate as evaluate
+    from qd.evaluate.gate import gate as gate
     from qd.evaluate.sets import make_sets as make_sets
     from qd.faults.judge import judge as judge
     from qd.search.loop import search as search
@@ -57,6 +58,7 @@ API = {
     "judge": "qd.faults.judge",
     "cross": "qd.workers.crosser",
     "evaluate": "qd.evaluate.evaluate",
+    "gate": "qd.evaluate.gate",
     "make_sets": "qd.evaluate.sets",
     "finetune": "train.finetune",
     "preset": "qd.search.settings",

@@ -308,8 +308,10 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
     With --pack it says which terrains of a pack of faults a controller fails. Crossings are stored, so after Ctrl-C the
     same command goes on.
 
-    For continuous integration (docs/testing.md), `--pack anymal --fail-under .9` exits with status 1 if the goal rate
-    may be lower, and `--policies old=A new=B --archive RUN` if B is worse on elites of RUN.
+    For continuous integration (docs/testing.md), `--gate gate.toml` asks what that file says, by tests that stop once
+    they are clear, of --policy, or of --policies old=A new=B. Its status is 0 for a pass, 1 for a fail, 2 for an error.
+    `--pack anymal --fail-under .9` exits with status 1 if the goal rate may be lower, and `--policies old=A new=B
+    --archive RUN` if B is worse on elites of RUN.
     """
 
     pack: str | None = None
@@ -317,15 +319,26 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
     the published one. --terrains takes the first of it; all on CUDA."""
     fail_under: Annotated[float, Meta(ge=0, le=1)] | None = None
     """With --pack: exit with status 1 if the lower end of the 95 % interval of the goal rate is below this."""
+    gate: Path | None = None
+    """Settings of a gate: tables [[check]] with pack = FOLDER or anymal or cassie, or set = hand_crafted or hard_random
+    with space; name, terrains (100), limit of the mean goal rate, margin (0.05), rounds (40), which are episodes of a
+    terrain at most; and before them error (0.05) and seed (0). docs/testing.md has one."""
+    junit: Path | None = None
+    """With --gate: file for the verdicts as JUnit XML."""
     policies: tuple[str, ...] = ()
     """Controllers of the tables, each NAME=FILE, NAME=file.py:callable, NAME=module:callable or NAME=shipped, the first
     to compare with; base=shipped if left out. C-G, C-G@1 and C-G@2 are three seeds of one kind."""
     out: Path | None = None
     """File for the numbers. If left out: runs/<robot>-rates.json, of another controller <robot>-<its name>-rates.json,
-    with a pack ...-pack.json; for tables runs/<robot>-tables/tables.json, of old and new compared.json."""
+    with a pack ...-pack.json, with a gate ...-gate.json; for tables runs/<robot>-tables/tables.json, of old and new
+    compared.json."""
 
     def execute(self) -> int:
         """Evaluates; returns 1 if a controller is too bad."""
+        if self.gate is not None:
+            return self._pass_gate(self.gate)
+        if self.junit is not None:
+            raise ValueError("--junit goes with --gate: give the gate too")
         from qd.check import ensure_ready
         from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
         from qd.evaluate.pack import PACK_FILE, evaluate_pack, find_pack, passes, read_pack
@@ -355,6 +368,23 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         robot = ensure_ready(robot, next(iter(controllers.values())), compute, skip_level_ground=True)
         cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
+
+    def _pass_gate(self, file: Path) -> int:
+        """Whether a gate says no."""
+        from qd.evaluate.gate import publish_gate
+
+        sets = {"pack": self.pack, "fail_under": self.fail_under, "sets": self.sets, "archive": self.archive}
+        sets |= {"independent": self.independent, "space": self.space, "terrains": self.terrains}
+        if given := [name for name, value in (sets | {"episodes": self.episodes}).items() if value]:
+            flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise ValueError(f"--gate says in its file what is crossed, got {flags} too: leave that out")
+        robot = get_robot(self.robot)
+        controllers = parse_controllers(self.policies, robot) if self.policies else {}
+        if self.policies and {*controllers} != {"old", "new"}:
+            raise ValueError(f"--gate compares --policies old=A new=B, got {', '.join(controllers)}: use these names")
+        controllers = controllers or {"new": self.policy or str(robot.policy_file)}
+        report = publish_gate(file, robot, controllers, _compute(self), out=self.out, junit=self.junit)
+        return int(not report["passes"])
 
 
 @dataclass(frozen=True, kw_only=True)

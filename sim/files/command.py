@@ -123,8 +123,8 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
 
     Returns:
         Exit status: what ``execute`` returns if that is a number, else 0; 2 for wrong flags and what a user can mend,
-        with one line on stderr, or the traceback where FAULTLINE_DEBUG=1; that of a UserError; 130 for Ctrl-C and
-        SIGTERM; 1 without a line if the output is closed, as in ``faultline ... | head -1``.
+        with one line on stderr, or the traceback where FAULTLINE_DEBUG=1 and of any other error; that of a UserError;
+        130 for Ctrl-C and SIGTERM; 1 without a line if the output is closed, as in ``faultline ... | head -1``.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -145,7 +145,8 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
             return 1
         remedy = _cache_remedy(error)
         if debugging() or not (remedy or isinstance(error, (ValueError, OSError, FloatingPointError, UserError))):
-            raise
+            traceback.print_exc()
+            return 2
         text = " ".join(filter(None, map(str.strip, str(error).splitlines())))
         say(("error:", "bold red"), f" {text}{remedy}", error=True)
         return error.status if isinstance(error, UserError) else 2

@@ -72,8 +72,11 @@ def _unknown(given: dict[str, Any], settings: Any, table: str = "") -> Iterator[
     if unknown := [f"{table}{key}" for key in given if key not in names]:
         yield f"{', '.join(unknown)}: there are {', '.join(names)}"
     for key, value in given.items():
-        if isinstance(value, dict) and is_dataclass(inner := getattr(settings, key, None)):
-            yield from _unknown(value, inner, f"{table}{key}.")
+        inner = getattr(settings, key, None)
+        tables = zip(value, inner, strict=False) if isinstance(value, list) and inner else [(value, inner)]
+        for content, held in tables:
+            if isinstance(content, dict) and is_dataclass(held):
+                yield from _unknown(content, held, f"{table}{key}.")
 
 
 def _mismatch(annotation: Any, value: Any) -> str | None:
