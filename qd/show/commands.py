@@ -194,9 +194,25 @@ class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
     """How many of the worst terrains to show close up, one a cause first."""
     tables: Path | None = None
     """Tables of an evaluation to show, such as results/anymal/tables.json; none if left out."""
+    evidence: tuple[Path, ...] = ()
+    """In place of a run, files that gates, doses, rates, tests on packs and searches (archive.json) wrote about one
+    controller: a page of what was tested, by which command, and what was not; evidence.html beside the first file."""
+    controller: str | None = None
+    """With --evidence: the controller's name in files of doses; their first if left out."""
+    verify: Path | None = None
+    """Only check that a page of evidence and its files are as its list of hashes says, evidence.sha256."""
 
     def execute(self) -> None:
         """Writes the page."""
+        if self.evidence or self.verify is not None:
+            from qd.show.report.evidence import verify_evidence, write_evidence
+
+            if self.verify is not None:
+                count = verify_evidence(self.verify)
+                print(f"{count} files are as {self.verify} says. That does not say who wrote them.")
+            else:
+                write_evidence(self.evidence, robot=self.robot, controller=self.controller, out=self.out)
+            return
         from qd.show.report.report import write_report
 
         named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space, "device": self.device}

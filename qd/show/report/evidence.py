@@ -1,0 +1,189 @@
+"""Evidence about one controller: one page of what was tested, by which command, and what was not, with its hashes.
+
+It is made of files that commands wrote: gates, doses, rates, tests on packs, searches. Nothing is crossed for it.
+``sha256sum --check`` reads its list of hashes, too. They show that files are as they were, and not who wrote them.
+"""
+
+import hashlib
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from qd.evaluate.dose import all_doses
+from qd.evaluate.gate import to_rows
+from qd.evaluate.labels import SETS
+from qd.faults.judge import STAGES
+from qd.show.report.page import Table, check_page, origin_rows, publish_page
+from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
+from sim.files.intervals import format_value
+from sim.robots.find import get_robot
+from sim.robots.robot import RobotCfg
+from sim.terrains.conditions.kinds import CONDITIONS
+
+SAFE_RATE = 0.9
+"""A size of an obstacle is within the limits of use if the goal rate's 95 % interval lies above this, at all smaller
+sizes, too."""
+_KINDS = {
+    "gate": ("checks", "no gate: tests of a gate.toml (faultline evaluate --gate)"),
+    "dose": ("dose", "no sizes of obstacles, and so no limits of use (faultline dose)"),
+    "rates": ("hand_crafted", "no rates on random terrains (faultline evaluate)"),
+    "pack": ("beside", "no test on a pack of faults (faultline evaluate --pack)"),
+    "search": ("reachable_cells", "no search for terrains that break it (faultline archive)"),
+}
+_COUNTS = {
+    "episodes": "episodes of the search",
+    "elites": "terrains, each the hardest of its kind",
+    "failing": "... that under half of the robots cross in fresh episodes",
+    "confirmed": "... also with finer physics",
+    "faults_controllers": "faults: another controller crosses them",
+    "faults_witness": "faults: only a steered robot crosses them",
+    "fault_families": "families of faults",
+    "faults_distinct": "distinct faults",
+}
+
+
+def find_kind(content: Mapping[str, Any], file: Path) -> str:
+    """What a file of numbers is: a key of the kinds that evidence is made of."""
+    for kind, (key, _) in _KINDS.items():
+        if key in content:
+            return kind
+    raise ValueError(f"{file} must be written by a gate, dose, rates, pack or search, got another file: leave it out")
+
+
+def tested_hash(content: Mapping[str, Any], kind: str, name: str | None) -> str | None:
+    """SHA-256 of the controller that a file is about; of a dose the one of that ``name``, or the only one."""
+    if kind != "dose":
+        return content["policy_sha256"]
+    controllers = content["controllers"]
+    name = name or next(iter(controllers))
+    return controllers[name]["sha256"] if name in controllers else None
+
+
+def dose_limits(content: Mapping[str, Any], controller: str, speed: float) -> list[tuple[str, str]]:
+    """Each obstacle of a dose and up to which size the controller may be used (:data:`SAFE_RATE`)."""
+    limits = []
+    for element, title in content["titles"].items():
+        rows = [row for row in content["dose"] if row["element"] == element and row["controller"] == controller]
+        safe = [row["interval"] is not None and row["interval"][0] >= SAFE_RATE for row in rows]
+        count = safe.index(False) if False in safe else len(rows)
+        unit = f" {rows[0]['unit']}" if rows[0]["unit"] else ""
+        if count:
+            rate = format_value(rows[count - 1]["goal_rate"], rows[count - 1]["interval"])
+            last = ", the last that was tried" if count == len(rows) else ""
+            way = "down" if rows[0]["value"] > rows[-1]["value"] else "up"
+            text = f"{way} to {rows[count - 1]['value']:g}{unit}{last}: {rate} reach the goal, at {speed:g} m/s"
+        else:
+            text = f"not at {rows[0]['value']:g}{unit}, the first that was tried"
+        limits.append((f"{title}, {rows[0]['parameter']}", text))
+    return limits
+
+
+def describe(content: Mapping[str, Any], kind: str, controller: str, speed: float) -> tuple[str, Table]:
+    """Title and table of a file's numbers."""
+    if kind == "gate":
+        return "Gate", Table(("", "verdict", "why"), [row[:3] for row in to_rows(content)])
+    if kind == "dose":
+        physics = "finer physics" if content["resolved"] else "the search's physics"
+        return f"Limits of use, with {physics}", Table((), dose_limits(content, controller, speed))
+    if kind == "search":
+        rows = [(text, f"{content[key]:,}") for key, text in _COUNTS.items() if content.get(key) is not None]
+        return f"Search of {content['space']}", Table((), rows)
+    sets = {"pack": content["rates"]} if kind == "pack" else {name: content[name] for name in list(SETS)[:2]}
+    rows = []
+    for name, rates in sets.items():
+        interval = rates.get("goal_interval") or rates.get("goal_rate_interval")
+        rows.append((SETS.get(name, name), format_value(rates["goal_rate"], interval), str(rates["terrains"])))
+    return ("Pack of faults" if kind == "pack" else "Rates"), Table(("", "goal rate", "terrains"), rows)
+
+
+def list_untested(contents: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
+    """What the files say nothing of."""
+    kinds = {kind for kind, _ in contents}
+    untested = [
+        "a real robot: all episodes are simulated",
+        *(why for kind, (_, why) in _KINDS.items() if kind not in kinds),
+    ]
+    spaces = "+".join(str(content.get("space", "")) for _, content in contents)
+    spaces += "+".join(check["settings"]["space"] or "" for _, c in contents for check in c.get("checks", ()))
+    dosed = {row["element"] for kind, content in contents if kind == "dose" for row in content["dose"]}
+    if dosed and (lacking := [name for name in all_doses() if name not in dosed]):
+        untested.append(f"other obstacles and conditions than those above: {', '.join(lacking)}")
+    if lacking := [name for name in CONDITIONS if name not in spaces and name not in dosed]:
+        untested.append(f"conditions: {', '.join(lacking)}")
+    judged = {stage for kind, content in contents if kind == "search" for stage in content.get("judged_by", {})}
+    if "search" in kinds and (lacking := [name for name in STAGES if name not in judged]):
+        untested.append(f"stages of judging what the search found: {', '.join(lacking)}")
+    return untested
+
+
+def write_evidence(
+    files: Sequence[Path], *, robot: str | None = None, controller: str | None = None, out: Path | None = None
+) -> Path:
+    """Writes the page, its numbers beside it as .json and the hashes of both and of all files as .sha256.
+
+    Args:
+        files: Files of numbers about one controller.
+        robot: The robot, if it is not shipped.
+        controller: Its name in files of doses; their first if None.
+        out: The page, *.html; evidence.html beside the first file if None.
+    """
+    contents = [(find_kind(content, file), content) for file in files for content in [read_json(file)]]
+    tested: RobotCfg = get_robot(robot or contents[0][1]["robot"])
+    about = {(content["robot_sha256"], tested_hash(content, kind, controller)) for kind, content in contents}
+    if len(about) != 1:
+        listed = ", ".join(
+            f"{file} of {str(tested_hash(c, k, controller))[:12]}" for file, (k, c) in zip(files, contents, strict=True)
+        )
+        raise ValueError(f"evidence must be about one controller of one robot, got {listed}: leave the others out")
+    out = out or files[0].with_name("evidence.html")
+    check_page(out)
+    for suffix in (".json", ".sha256"):
+        prepare_output(out.with_suffix(suffix))
+    names = [os.path.relpath(file, out.parent) for file in files]
+    hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    parts = []
+    for (kind, content), name, digest in zip(contents, names, hashes, strict=True):
+        label = controller or (next(iter(content["controllers"])) if kind == "dose" else "")
+        title, table = describe(content, kind, label, tested.speed)
+        origin = [
+            ("file", name),
+            ("sha256", digest),
+            *origin_rows(content),
+            ("sources_sha256", content["sources_sha256"]),
+        ]
+        origin += [("changed", "sources differed from the commit")] if content["dirty"] else []
+        parts.append({"title": title, "table": table._asdict(), "origin": origin})
+    robot_sha256, policy_sha256 = about.pop()
+    evidence = {
+        "robot": tested.name, "robot_sha256": robot_sha256, "policy_sha256": policy_sha256, "speed": tested.speed,
+        "safe_rate": SAFE_RATE, "parts": parts, "not_tested": list_untested(contents),
+    }  # fmt: skip
+    publish_page(out, "evidence.html", **evidence)
+    write_atomically(out.with_suffix(".json"), to_json(evidence))
+    own = [out.name, out.with_suffix(".json").name]
+    sums = [(hashlib.sha256((out.parent / name).read_bytes()).hexdigest(), name) for name in own]
+    lines = [f"{digest}  {name}\n" for digest, name in [*sums, *zip(hashes, names, strict=True)]]
+    write_atomically(out.with_suffix(".sha256"), "".join(lines).encode())
+    return out
+
+
+def verify_evidence(file: Path) -> int:
+    """How many files are as a list of hashes says; a ValueError names those that are not."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    rows = [match.groups() for line in lines if (match := re.fullmatch(r"([0-9a-f]{64}) [ *](.+)", line))]
+    if not rows or len(rows) < len(lines):
+        raise ValueError(
+            f"{file} must be a list of SHA-256, as `faultline report --evidence` writes it: give that file"
+        )
+    wrong = []
+    for digest, name in rows:
+        path = file.parent / name
+        if not path.is_file():
+            wrong.append(f"{name} is gone")
+        elif hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            wrong.append(f"{name} was changed")
+    if wrong:
+        raise ValueError(f"{file} does not hold: {', '.join(wrong)}")
+    return len(rows)
