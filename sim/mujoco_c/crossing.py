@@ -44,7 +44,7 @@ from sim.terrains.conditions.kinds import nominal_row, split_row
 from sim.terrains.terrains import GroundMaps, Terrains
 
 _WARNING_NAMES = ("CONTACTFULL", "CNSTRFULL", "BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
-_WARNINGS = [getattr(mj.mjtWarning, f"mjWARN_{name}") for name in _WARNING_NAMES]
+_WARNINGS = np.array([getattr(mj.mjtWarning, f"mjWARN_{name}").value for name in _WARNING_NAMES])
 
 
 @lru_cache(maxsize=8)
@@ -102,7 +102,8 @@ class EpisodeStates:
         self.row = nominal_row() if conditions is None else conditions
         self.qpos = starts.qpos.copy()
         self._heights = np.zeros((2, 2)) if heights is None else heights
-        self._conditions = split_row(self.row)
+        acting = (pair for pair in split_row(self.row) if pair[0].acts(self.row))
+        self._conditions = sorted(acting, key=lambda pair: pair[0].disturbs_last)
         for condition, values in self._conditions:
             condition.begin_plain(self, values)
         self._model = model if robot.saturation_effort is None else copy(model)  # limits change with the speed
@@ -111,9 +112,12 @@ class EpisodeStates:
             data.qpos[:] = qpos
             data.qvel[:] = qvel
         self.qvel = starts.qvel.copy()
-        self.forces = np.zeros((len(self.data), len(robot.geom_names), 3))
-        self.torques = np.zeros((len(self.data), robot.num_joints))
+        self._sensed = np.zeros((len(self.data), model.nsensordata))
+        self.forces = self._sensed.reshape(len(self.data), len(robot.geom_names), 3)
+        self._warnings = np.zeros((len(self.data), mj.mjtWarning.mjNWARNING.value), int)
         self.warned = np.zeros(len(self.data), bool)
+        # To ask MuJoCo for an array takes longer than to copy it.
+        self._views = [(d, d.ctrl, d.qpos, d.qvel, d.sensordata, d.warning.number) for d in self.data]
         self._joints = model.actuator_trnid[:, 0] - 1
         self._effort = model.actuator_forcerange[:, 1] / self.strength
         motors = np.array([robot.saturation_effort, robot.velocity_limit])
@@ -130,25 +134,23 @@ class EpisodeStates:
             controls = condition.drive_plain(self, values, controls, self._steps)
         if self._net is not None:
             controls = self._net.step(controls - self.qpos[:, 7 + self._joints], self.qvel[:, 6 + self._joints])
-        for k in running:
+        for k in running if self._conditions else ():
             self.data[k].xfrc_applied[:] = 0.0
         for condition, values in self._conditions:
             condition.force_plain(self, values, running, self._steps)
         self._steps += 1
-        for k in running:
-            data = self.data[k]
-            data.ctrl[:] = controls[k]
+        for k in running.tolist():
+            data, ctrl, qpos, qvel, sensed, warnings = self._views[k]
+            ctrl[:] = controls[k]
             if self._motors is not None:
                 stall, limit = self._motors
-                lost = stall * data.qvel[6 + self._joints] / limit
+                lost = stall * qvel[6 + self._joints] / limit
                 limits = np.clip([-stall - lost, stall - lost], -self._effort, self._effort).T
                 self._model.actuator_forcerange[:] = self.strength * limits
             mj.mj_step(self._model, data)
-            self.qpos[k] = data.qpos
-            self.qvel[k] = data.qvel
-            self.forces[k] = data.sensordata.reshape(-1, 3)
-            self.torques[k] = data.qfrc_actuator[6:]
-            self.warned[k] = any(data.warning[warning].number for warning in _WARNINGS)
+            self.qpos[k], self.qvel[k], self._sensed[k], self._warnings[k] = qpos, qvel, sensed, warnings
+        if self._warnings.any():
+            self.warned[:] = self._warnings[:, _WARNINGS].any(axis=1)
 
     def find_ground(self, x: Array, y: Array) -> Array:
         """Heights [m] of the terrain at world-local points [m] of any one shape."""
@@ -156,26 +158,33 @@ class EpisodeStates:
 
     def disturb(self, rows: Array, running: NDArray[np.intp], step: int) -> Array:
         """Observations (num_episodes, observation_size) as the conditions show them; pushes the running episodes."""
-        for condition, values in sorted(self._conditions, key=lambda pair: pair[0].disturbs_last):
+        for condition, values in self._conditions:
             rows = condition.disturb_plain(self, values, rows, running, step)
         return rows
 
 
+_SENSES: dict[str, Callable[[EpisodeStates, NDArray[np.bool_]], Array]] = {
+    "pose": lambda episodes, feet: episodes.qpos[:, :7],
+    "contacts": lambda episodes, feet: 0.01 * np.linalg.norm(episodes.forces[:, feet], axis=2),
+    "torques": lambda episodes, feet: 0.01 * np.array([data.qfrc_actuator[6:] for data in episodes.data]),
+}
+
+
 def _judge(
     robot: RobotCfg,
-    episodes: EpisodeStates,
-    running: NDArray[np.intp],
+    episode: NDArray[np.intp],
+    state: list[NDArray[Any]],
     base: NDArray[np.bool_],
     routes: Routes,
     starts: Starts,
     *,
-    ends: bool,
-) -> Array:
-    """Outcome of each running episode after a physics step, the gravest of several; its time ``ends``, or not."""
+    ends: NDArray[np.bool_],
+) -> NDArray[Any]:
+    """Outcome of an ``episode`` after a physics step, row by row, the gravest of several; its time ``ends``, or not."""
+    qpos, qvel, forces, warned = state
     cfg = CrossingCfg
-    qpos = episodes.qpos[running]
     position = qpos[:, :2]
-    outcome = np.full(len(running), Outcome.TIME_OUT if ends else Outcome.RUNNING)
+    outcome = np.where(ends, Outcome.TIME_OUT, Outcome.RUNNING)
     out = ((position < cfg.lower) | (position > cfg.upper)).any(axis=1)
     if routes.kind == Kind.CROSS:
         outcome[out] = Outcome.OUT
@@ -183,16 +192,30 @@ def _judge(
     else:
         if routes.kind == Kind.ROUTE:
             outcome[out | ends] = Outcome.GOAL
-            outcome[routes.strayed[running] >= round(cfg.stray_s / robot.control_dt)] = Outcome.STRAYED
-        elif ends:
-            near = np.hypot(*(starts.qpos[running, :2] - position).T) <= float(STAND_RADIUS)
-            outcome[:] = np.where(near, Outcome.GOAL, Outcome.STRAYED)
+            outcome[routes.strayed[episode] >= round(cfg.stray_s / robot.control_dt)] = Outcome.STRAYED
+        else:
+            near = np.hypot(*(starts.qpos[episode, :2] - position).T) <= float(STAND_RADIUS)
+            outcome[ends] = np.where(near, Outcome.GOAL, Outcome.STRAYED)[ends]
         outcome[2.0 * (qpos[:, 4] ** 2 + qpos[:, 5] ** 2) - 1.0 > float(FALLEN_GRAVITY_Z)] = Outcome.TILT
-    force = np.linalg.norm(episodes.forces[running][:, base], axis=2).max(axis=1)
+    force = np.linalg.norm(forces[:, base], axis=2).max(axis=1)
     outcome[force > cfg.base_force] = Outcome.BASE_COLLISION
-    finite = np.isfinite(qpos).all(axis=1) & (np.abs(episodes.qvel[running]) <= robot.max_speed).all(axis=1)
-    outcome[~finite | episodes.warned[running]] = Outcome.INVALID
+    finite = np.isfinite(qpos).all(axis=1) & (np.abs(qvel) <= robot.max_speed).all(axis=1)
+    outcome[~finite | warned] = Outcome.INVALID
     return outcome
+
+
+_SUMMED = 25  # control steps at a time: NumPy takes as long for few rows as for many
+
+
+def _add_up(
+    robot: RobotCfg, counted: list[list[NDArray[Any]]], feet: NDArray[np.bool_], sums: Array, deviation: Array
+) -> None:
+    """Adds penalties of the counted states to the sums, raises the deviation to theirs, and drops them."""
+    episode, *states = (np.concatenate(parts) for parts in zip(*counted, strict=True))
+    raw = step_penalties(*states, feet=feet, force_limit=robot.contact_force_limit)
+    np.add.at(sums, episode, robot.physics_dt * raw)
+    np.maximum.at(deviation, episode, distances_from_line(states[0]))
+    counted.clear()
 
 
 @torch.inference_mode()
@@ -223,6 +246,7 @@ def cross_in_mujoco_c(
     steps = np.zeros(count, int)
     sums = np.zeros((count, len(PENALTIES)))
     deviation = np.zeros(count)
+    counted: list[list[NDArray[Any]]] = []
     last_action = np.zeros((count, robot.num_joints))
     rows = np.zeros((count, robot.observation_size))
     remembers = reset_all(policy, count)  # it must be asked for the same robots every time
@@ -231,38 +255,48 @@ def cross_in_mujoco_c(
     row = nominal_row() if ground is None else ground.rows[0]
     stray_m = read_stray(robot) if row[-1] == Kind.ROUTE else math.inf
     routes = Routes(robot, row.astype(np.float64), count, stray_m)
-    for step in range(max_steps):
+    for step in range(0, max_steps, robot.decimation):
         if len(running := np.flatnonzero(outcome == Outcome.RUNNING)) == 0:
             break
-        if step % robot.decimation == 0:
-            qpos = episodes.qpos[running]
-            command = np.zeros((count, 3))
-            command[running] = goal_commands(qpos, robot.speed)
-            if routes.kind != Kind.CROSS:
-                command[running] = routes.command(episodes.qpos, step * robot.physics_dt)[running]
-            if steering is not None:
-                steered = running[~np.isnan(steering[running, 0, 0])]
-                command[steered] = steered_commands(episodes.qpos[steered], steering[steered], highest)
-            seen = (heights, qpos, episodes.qvel[running], command[running], last_action[running])
-            row = observations(*seen, default_joint_pos=default, scan=scan)
-            touches = 0.01 * np.linalg.norm(episodes.forces[running][:, feet], axis=2)
-            senses = {"pose": qpos[:, :7], "contacts": touches, "torques": 0.01 * episodes.torques[running]}
-            rows[running] = np.hstack([row, *(senses[name] for name in senses if name in robot.senses)])
-            rows = episodes.disturb(rows, running, step)
-            observed = rows if remembers else rows[running]
-            action = policy(torch.as_tensor(observed, dtype=torch.float32)).numpy().astype(np.float64)
-            action = action[running] if remembers else action
-            limited = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
-            action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
-            last_action[running] = action
-            episodes.targets[running] = default + robot.action_scale * action
-        episodes.step(running)
-        judged = _judge(robot, episodes, running, base, routes, starts, ends=step + 1 >= max_steps)
-        outcome[running] = judged
-        steps[running] += 1
-        deviation[running] = np.maximum(deviation[running], distances_from_line(episodes.qpos[running]))
-        state = (episodes.qpos[running], episodes.qvel[running], command[running], episodes.forces[running])
-        sums[running] += robot.physics_dt * step_penalties(*state, feet=feet, force_limit=robot.contact_force_limit)
+        qpos = episodes.qpos[running]
+        command = np.zeros((count, 3))
+        command[running] = goal_commands(qpos, robot.speed)
+        if routes.kind != Kind.CROSS:
+            command[running] = routes.command(episodes.qpos, step * robot.physics_dt)[running]
+        if steering is not None:
+            steered = running[~np.isnan(steering[running, 0, 0])]
+            command[steered] = steered_commands(episodes.qpos[steered], steering[steered], highest)
+        seen = (heights, qpos, episodes.qvel[running], command[running], last_action[running])
+        row = observations(*seen, default_joint_pos=default, scan=scan)
+        felt = [sense(episodes, feet)[running] for name, sense in _SENSES.items() if name in robot.senses]
+        rows[running] = np.hstack([row, *felt])
+        rows = episodes.disturb(rows, running, step)
+        observed = rows if remembers else rows[running]
+        action = policy(torch.from_numpy(observed.astype(np.float32))).numpy().astype(np.float64)
+        action = action[running] if remembers else action
+        limited = np.clip(action, -float(ACTION_LIMIT), float(ACTION_LIMIT))
+        action = np.where(np.isfinite(action), limited, np.nan)  # of which MuJoCo warns: the episode is invalid
+        last_action[running] = action
+        episodes.targets[running] = default + robot.action_scale * action
+        states: list[list[NDArray[Any]]] = []
+        for _ in range(min(robot.decimation, max_steps - step)):
+            episodes.step(running[~episodes.warned[running]])  # a state that has blown up stays as it is
+            after = (episodes.qpos, episodes.qvel, episodes.forces, episodes.warned)
+            states.append([running, *(values[running] for values in after)])
+        # Rows by physics step, then episode.
+        episode, *state = (np.concatenate(parts) for parts in zip(*states, strict=True))
+        ends = np.arange(len(episode)) >= (max_steps - 1 - step) * len(running)
+        judged = _judge(robot, episode, state, base, routes, starts, ends=ends)
+        ended = (judged != Outcome.RUNNING).reshape(len(states), -1)
+        counts = (np.cumsum(ended, axis=0) <= ended).ravel()  # up to the end of each episode
+        episode, judged, qpos, qvel, forces = (values[counts] for values in (episode, judged, *state[:3]))
+        outcome[episode] = judged  # the last of each
+        episodes.qpos[episode] = qpos
+        steps += np.bincount(episode, minlength=count)
+        if len(counted) == _SUMMED:
+            _add_up(robot, counted, feet, sums, deviation)
+        counted.append([episode, qpos, qvel, command[episode], forces])
+    _add_up(robot, counted, feet, sums, deviation)
     sums[outcome == Outcome.INVALID] = np.nan
     upright = 1.0 - 2.0 * (episodes.qpos[:, 4] ** 2 + episodes.qpos[:, 5] ** 2)
     return RolloutResult(

@@ -207,15 +207,21 @@ def surface_heights(heights: Heights, x: Array, y: Array) -> Array:
     i = np.minimum(row.astype(int), num_rows - 2)
     u = column - j
     v = row - i
-    (near, along_x), (along_y, far) = ((heights[k, j], heights[k, j + 1]) for k in (i, i + 1))
+    corner, nodes = num_cols * i + j, heights.ravel()
+    near, along_x, along_y, far = (nodes[corner + further] for further in (0, 1, num_cols, num_cols + 1))
     lower = near + u * (along_x - near) + v * (along_y - near)
     upper = far + (1 - u) * (along_y - far) + (1 - v) * (along_x - far)
     return np.where(u + v <= 1, lower, upper)
 
 
+def _unit_quaternions(qpos: Array) -> Array:
+    """Rows w, x, y, z, shape (4, num)."""
+    return (qpos[:, 3:7] / np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)).T
+
+
 def _rotations(qpos: Array) -> Array:
     """Matrices (num, 3, 3) that turn base-frame vectors into the world frame."""
-    w, x, y, z = (qpos[:, 3:7] / np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)).T
+    w, x, y, z = _unit_quaternions(qpos)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -224,14 +230,14 @@ def _rotations(qpos: Array) -> Array:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def _base_velocity(qpos: Array, qvel: Array) -> Array:
+def _base_velocity(rotations: Array, qvel: Array) -> Array:
     """Velocity of the base's origin in the base frame [m/s], shape (num, 3)."""
-    return np.einsum("nij,ni->nj", _rotations(qpos), qvel[:, :3])
+    return np.einsum("nij,ni->nj", rotations, qvel[:, :3])
 
 
 def _heading(qpos: Array) -> Array:
-    forward = _rotations(qpos)[:, :, 0]
-    return np.arctan2(forward[:, 1], forward[:, 0])
+    w, x, y, z = _unit_quaternions(qpos)
+    return np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
 
 def goal_commands(qpos: Array, speed: float) -> Array:
@@ -333,7 +339,7 @@ def observations(
     y = qpos[:, 1:2] + np.sin(heading) * scan_x + np.cos(heading) * scan_y
     return np.concatenate(
         [
-            2.0 * _base_velocity(qpos, qvel),
+            2.0 * _base_velocity(rotations, qvel),
             0.25 * qvel[:, 3:6],
             -rotations[:, 2, :],  # gravity's direction in the base frame
             command * [2.0, 2.0, 0.25],
@@ -354,6 +360,6 @@ def step_penalties(
     States and commands are those of :func:`observations`; contact forces on each geom with a role, world frame [N],
     have shape (num, num_geoms, 3). ``feet``, shape (num_geoms,), may be touched; up to the limit [N] it costs nothing.
     """
-    base = {"velocity": _base_velocity(qpos, qvel), "ang_vel": qvel[:, 3:6], "command": command}
+    base = {"velocity": _base_velocity(_rotations(qpos), qvel), "ang_vel": qvel[:, 3:6], "command": command}
     step = PlainStep(**base, forces=forces, feet=feet, force_limit=force_limit)
     return np.stack([penalty.plain(step).astype(float) for penalty in PENALTIES.values()], axis=1)

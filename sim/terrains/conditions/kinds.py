@@ -100,8 +100,14 @@ class Condition:
         genes = (gene.to_gene(values[gene.name]) if gene.name in values else gene.absent for gene in self.genes)
         return np.stack(np.broadcast_arrays(*genes), axis=-1)
 
+    def acts(self, row: Array) -> bool:
+        """Whether it changes anything under a row of conditions; if not, MuJoCo C leaves it out."""
+        first = condition_column(self.genes[0].name)
+        nominal = np.float32([gene.to_value(gene.absent) for gene in self.genes])
+        return bool((row[first : first + len(nominal)] != nominal).any())
+
     def begin_plain(self, episodes: Any, values: Array) -> None:
-        """Varies the model, ``strength`` or ``delay_steps`` of a :class:`sim.mujoco_c.crossing.Episodes`."""
+        """Varies the model, ``strength`` or ``delay_steps`` of a :class:`sim.mujoco_c.crossing.EpisodeStates`."""
 
     def disturb_plain(self, episodes: Any, values: Array, rows: Array, running: Any, step: int) -> Array:
         """Observations (num_episodes, observation_size) as shown to the controller; may push the episodes ``running``.

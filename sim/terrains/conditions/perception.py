@@ -97,15 +97,16 @@ def _disturb_scan(step: DisturbedStep, row: wp.array[float], first: int, env: in
 class Scans:
     """What the height scans of the episodes in MuJoCo C have shown (:class:`sim.mujoco_c.crossing.EpisodeStates`)."""
 
-    def __init__(self, episodes: Any) -> None:
-        self._episodes = episodes
+    def __init__(self, episodes: Any, values: dict[str, float]) -> None:
+        """``values`` are the numbers of all errors of the map."""
+        self._episodes, self._values = episodes, values
         self._points = np.stack(episodes.robot.scan_points()).astype(np.float64)
         self._poses: list[Array] = []
         self._held: Array | None = None
 
-    def errors(self, values: dict[str, float], age: int) -> Array:
+    def errors(self, age: int) -> Array:
         """What the scans show less what is true, of the control step ``age``, shape (num_episodes, num_scan_points)."""
-        episodes, (scan_x, scan_y) = self._episodes, self._points
+        episodes, values, (scan_x, scan_y) = self._episodes, self._values, self._points
         qpos, control_dt = episodes.qpos, episodes.robot.control_dt
         (x, y, z), (w, i, j, k) = qpos[:, :3].T, qpos[:, 3:7].T
         yaw = np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))
@@ -189,19 +190,20 @@ class MapShift(Misperception):
             parts.append(f"turned by {abs(degrees):.0f} degrees to the {'right' if degrees < 0 else 'left'}")
         return f"height map {', '.join(parts)}" if parts else ""
 
+    def acts(self, row: Array) -> bool:
+        """Whether the map has any error."""
+        return any(Condition.acts(CONDITIONS[name], row) for name in GROUPS["map"])
+
     def begin_plain(self, episodes: Any, values: Array) -> None:
         """Begins to keep what the scans show."""
-        episodes.scans = Scans(episodes)
+        numbers = {gene.name: condition_column(gene.name) for name in GROUPS["map"] for gene in CONDITIONS[name].genes}
+        episodes.scans = Scans(episodes, {name: float(episodes.row[column]) for name, column in numbers.items()})
 
     def disturb_plain(self, episodes: Any, values: Array, rows: Array, running: Any, step: int) -> Array:
         """Adds what is wrong by all errors of the map."""
-        named = {gene.name: gene for name in GROUPS["map"] for gene in CONDITIONS[name].genes}
-        numbers = {name: float(episodes.row[condition_column(name)]) for name in named}
-        if any(numbers[name] != gene.to_value(gene.absent) for name, gene in named.items()):
-            first = sum(episodes.robot.column_sizes[:8])
-            scan = slice(first, first + episodes.robot.column_sizes[8])
-            wrong = episodes.scans.errors(numbers, step // episodes.robot.decimation)
-            rows[running, scan] += wrong[running]
+        first = sum(episodes.robot.column_sizes[:8])
+        scan = slice(first, first + episodes.robot.column_sizes[8])
+        rows[running, scan] += episodes.scans.errors(step // episodes.robot.decimation)[running]
         return rows
 
 
