@@ -1,4 +1,5 @@
-# The doors of the project. Every target works in .venv, which `make setup` builds from pyproject.toml and constraints.txt.
+# The doors of the project. Every target works in .venv, built from pyproject.toml and constraints.txt: `make setup` installs all
+# packages, a target that only searches and shows installs those that this takes.
 .DEFAULT_GOAL := help
 .PHONY: help setup archive train finetune harden evaluate report view bench docs pictures test test-all test-gpu lint
 
@@ -7,6 +8,8 @@ ROBOT ?=
 ARGS ?=
 TORCH ?=
 BIN := .venv/bin
+EXTRAS := [cluster,dev,menagerie,onnx,train]
+SEARCH := .venv/.search-done
 STAMP := .venv/.setup-done
 # The torch that was asked for is kept: a later setup does not put the pinned one back.
 ifneq ($(TORCH),)
@@ -45,18 +48,27 @@ help: ## This list
 setup: $(STAMP) ## Make .venv with the pinned packages, unless it is up to date
 
 .PHONY: anew
-$(STAMP): pyproject.toml constraints.txt $(ANEW)
+# $(1): extras in brackets. Python compiles a module when it is first imported; pip would compile all of them, most for nobody.
+define install
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "make setup: PYTHON=$(PYTHON) must be Python 3.11 or newer, got: $$($(PYTHON) --version 2>&1)." >&2; \
 	  echo 'Name another one: make setup PYTHON=python3.12' >&2; exit 1; }
-	@echo 'Installing the pinned packages into .venv. The first time takes some minutes.'
+	@echo 'Installing the pinned packages$(if $(1), with extras $(1)) into .venv. The first time takes some minutes.'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	grep -v $(if $(TORCH),'^torch==','^$$') constraints.txt > .venv/constraints.txt
 	$(if $(TORCH),$(BIN)/python -m pip install $(call quoted,$(TORCH)) && echo $(call quoted,$(TORCH)) > .venv/torch)
-	$(BIN)/python -m pip install --quiet -e '.[dev,cluster,menagerie]' -c .venv/constraints.txt
+	$(BIN)/python -m pip install --no-compile -e '.$(1)' -c .venv/constraints.txt
+endef
+
+$(SEARCH): pyproject.toml constraints.txt $(ANEW)
+	$(call install)
 	@touch $@
 
-archive: setup ## Search the terrains on which a controller fails; writes a run under runs/
+$(STAMP): pyproject.toml constraints.txt $(ANEW)
+	$(call install,$(EXTRAS))
+	@touch $(SEARCH) $@
+
+archive: $(SEARCH) ## Search the terrains on which a controller fails; writes a run under runs/
 	$(call faultline,archive)
 
 train: setup ## Train a base controller from scratch
@@ -68,13 +80,13 @@ finetune: setup ## Train a controller further on terrains that broke it
 harden: setup ## Rounds of search and training, until a search finds little that breaks the controller
 	$(call faultline,harden)
 
-evaluate: setup ## Measure rates of one controller, or make the tables of several
+evaluate: $(SEARCH) ## Measure rates of one controller, or make the tables of several
 	$(call faultline,evaluate)
 
-report: setup ## Write one HTML page about a run
+report: $(SEARCH) ## Write one HTML page about a run
 	$(call faultline,report)
 
-view: setup ## Show an archive in the browser
+view: $(SEARCH) ## Show an archive in the browser
 	$(call faultline,view)
 
 bench: setup ## Time every kernel against torch and against the device's ceiling

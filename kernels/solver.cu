@@ -1,6 +1,6 @@
 struct Point { float cost, slope, curve; };
 struct Spring { float stiffness, damping, impedance; };
-constexpr int NV = $dofs, DIM = $dimensions, MAX_CONTACTS = $contacts, NUM_SHARED = $num_shared, LD = $stride, CHUNK = $chunk;
+constexpr int NV = $dofs, DIM = $dimensions, NUM_SHARED = $num_shared, LD = $stride, CHUNK = $chunk;
 constexpr int PER_LANE = (NV + LANES - 1) / LANES;  // a lane has dof `lane` and every LANES-th after it
 constexpr bool HAS_LOSSES = $losses;
 constexpr float MINVAL = ${minval}f, EPS = 8.0f * 1.1920929e-07f;
@@ -11,7 +11,7 @@ struct alignas(16) Contact {
     int state;
 };
 using LaneVector = float[PER_LANE];
-using Row = float[NV];  // one row of a matrix
+using Row = float[LANES == 1 ? LD : NV];  // one row of a matrix; with its end a CPU takes four numbers at once
 using LaneRows = Row[PER_LANE];
 using Vec = wp::vec_t<3, float>;
 using Vec2 = wp::vec_t<2, float>;
@@ -23,10 +23,10 @@ float* coefficient = part + CHUNK * DIM * LD;  // CHUNK x DIM x DIM
 Contact* shared_contacts = (Contact*)(coefficient + (CHUNK * DIM * DIM + 3) / 4 * 4);
 constexpr int NUM_FLOATS = (NV + 1 + CHUNK * DIM) * LD + (CHUNK * DIM * DIM + 3) / 4 * 4 + NUM_SHARED * sizeof(Contact) / 4;
 static_assert(NUM_FLOATS == $num_floats, "kernels/solver.py counts memory otherwise");
-Contact* spilled_contacts =
-    MAX_CONTACTS > NUM_SHARED ? (Contact*)&wp::index(problem.spilled_contacts, world, 0) : shared_contacts;
+Contact* spilled_contacts = (Contact*)&wp::index(problem.spilled_contacts, world, 0);
 auto get_contact = [&](int c) -> Contact& { return c < NUM_SHARED ? shared_contacts[c] : spilled_contacts[c - NUM_SHARED]; };
-const int num_found = problem.contacts.count.data[world], num_contacts = wp::min(num_found, MAX_CONTACTS);
+const int capacity = problem.contacts.shape.shape[1];  // no constant: a robot with room for more has the same kernel
+const int num_found = problem.contacts.count.data[world], num_contacts = wp::min(num_found, capacity);
 const float dt = wp::index(problem.timestep, world % problem.timestep.shape[0]);
 const float root_impratio = wp::index(problem.impratio_invsqrt, world % problem.impratio_invsqrt.shape[0]);
 const float tolerance = wp::index(problem.tolerance, world % problem.tolerance.shape[0]);
@@ -65,7 +65,7 @@ auto read_inertia = [&](Row& row, int i, float more) {  // a row, with more on t
         const Float4 four = *(const Float4*)(inertia + wp::min(i, NV - 1) * LD + j);
         #pragma unroll
         for (int k = 0; k < 4; ++k) {
-            if (j + k < NV) row[j + k] = four.v[k] + (i == j + k ? more : 0.0f);
+            if (LANES == 1 || j + k < NV) row[j + k] = four.v[k] + (i == j + k ? more : 0.0f);
         }
     }
 };
@@ -152,7 +152,9 @@ auto update_forces = [&]() {
 // Solves h x = y in place by L D L^T, column by column; h is overwritten. Each lane holds its rows. The pivot row goes through
 // shared memory: h is symmetric, so each lane writes one number of it.
 auto solve = [&](LaneRows& h, LaneVector& y) {
-    constexpr bool ONE = LANES == 1;  // skips finished rows; loops of a warp need constant bounds to be unrolled
+    // One thread skips finished rows, and changes finished numbers of a row with the others: nobody reads them again. Loops of
+    // a warp need constant bounds to be unrolled.
+    constexpr bool ONE = LANES == 1;
     float inverse[PER_LANE];
     #pragma unroll ALL
     for (int k = 0; k < NV; ++k) {
@@ -175,7 +177,7 @@ auto solve = [&](LaneRows& h, LaneVector& y) {
                 const Float4 four = *(const Float4*)(row + j);
                 #pragma unroll
                 for (int n = 0; n < 4; ++n) {
-                    if (j + n > k && j + n < NV) h[m][j + n] -= below * four.v[n];
+                    if (ONE || (j + n > k && j + n < NV)) h[m][j + n] -= below * four.v[n];
                 }
             }
         }
@@ -271,7 +273,7 @@ auto add_contacts = [&](LaneRows& h) {
                         const Float4 four = *(const Float4*)(row_values + j);
                         #pragma unroll
                         for (int k = 0; k < 4; ++k) {
-                            if (j + k < NV) h[m][j + k] += value * four.v[k];
+                            if (LANES == 1 || j + k < NV) h[m][j + k] += value * four.v[k];
                         }
                     }
                 }
@@ -355,7 +357,7 @@ auto evaluate_loss = [](float d, float max_force, float x, float v) {
     const float sign = x < 0.0f ? -1.0f : 1.0f;
     return Point{max_force * (sign * x - 0.5f * range), sign * max_force * v, 0.0f};
 };
-constexpr int READ = LANES == 1 ? MAX_CONTACTS : 1;  // a CPU keeps all contacts of a search, a lane its first
+constexpr int READ = LANES == 1 ? 64 : 1;  // contacts of a search that a CPU keeps; a lane keeps its first
 Line lines[READ];
 float gauss_slope, gauss_curve;  // inertia gives a parabola
 // `first` reads the contacts and computes the constraints' cost at 0.
@@ -369,10 +371,11 @@ auto evaluate_line = [&](float alpha, bool first, float& cost0) {
     };
     #pragma unroll 1
     for (int c = lane; c < num_contacts; c += LANES) {
+        const bool kept = LANES == 1 ? c < READ : c == lane;
         Line& stored = lines[LANES == 1 ? c % READ : 0];
         Line line = stored;
-        if (first || (LANES > 1 && c != lane)) line = read_contact(get_contact(c));
-        if (first && (LANES == 1 || c == lane)) stored = line;
+        if (first || !kept) line = read_contact(get_contact(c));
+        if (first && kept) stored = line;
         before += line.cost0;
         add(evaluate_contact(line, alpha));
     }
@@ -596,7 +599,7 @@ for (int c = lane; c < num_contacts; c += LANES) {
 }
 times_inertia(momentum);
 
-int iteration = 0, bits = num_found > MAX_CONTACTS ? $too_many_contacts : 0;
+int iteration = 0, bits = num_found > capacity ? $too_many_contacts : 0;
 float alpha = 0.0f, gained = 0.0f;
 bool done = false;
 while (true) {
@@ -615,7 +618,8 @@ while (true) {
     }
     // Newton's direction; in the last pass the change of the velocities (MuJoCo's implicitfast). The code for both is the same
     // code: a kernel that does not fit into the instruction cache is slow.
-    float h[PER_LANE][NV], solved[PER_LANE];
+    LaneRows h;
+    float solved[PER_LANE];
     #pragma unroll ALL
     for (int m = 0; m < PER_LANE; ++m) {
         const int i = lane + m * LANES;

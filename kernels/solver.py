@@ -65,7 +65,7 @@ class Problem:
     surfaces: Surfaces
     contacts: Contacts
     spilled_contacts: wp.array2d[float]
-    """Contacts that do not fit into shared memory, shape (num_worlds, :attr:`Sizes.global_floats`)."""
+    """Contacts that do not fit into shared memory, shape (num_worlds, :meth:`Sizes.global_floats`)."""
     qacc_warmstart: wp.array2d[float]
     solver_niter: wp.array[int]
     overflow: wp.array[int]
@@ -76,8 +76,6 @@ class Sizes:
     """Sizes of a model, which its kernel is compiled for."""
 
     dofs: int
-    contacts: int
-    """Capacity for contacts of a robot."""
     dimensions: int
     """Rows of the largest contact."""
     inertia: int
@@ -103,17 +101,16 @@ class Sizes:
     def shared_contacts(self) -> int:
         """Contacts in shared memory."""
         room = (_SHARED_FLOATS - self._matrix_floats) // self._floats_per_contact
-        return min(self.contacts, max(_MIN_SHARED_CONTACTS, room))
+        return max(_MIN_SHARED_CONTACTS, room)
 
     @property
     def shared_floats(self) -> int:
         """Floats of shared memory that a robot needs."""
         return self._matrix_floats + self.shared_contacts * self._floats_per_contact
 
-    @property
-    def global_floats(self) -> int:
-        """Floats of global memory that a robot needs."""
-        return (self.contacts - self.shared_contacts) * self._floats_per_contact
+    def global_floats(self, capacity: int) -> int:
+        """Floats of global memory that a robot needs, with room for ``capacity`` contacts; at least 1."""
+        return max(1, (capacity - self.shared_contacts) * self._floats_per_contact)
 
 
 @cache

@@ -8,7 +8,7 @@ import math
 from bisect import bisect_left
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,6 @@ from sim.files.atomic import prepare_output, read_json, to_json, write_atomicall
 from sim.files.templates import open_templates
 from sim.robots.find import read_penalty_scales
 from sim.robots.robot import RobotCfg
-from sim.robots.stand import Standing, describe_model, stand
 from sim.robots.user import describe_inferred, write_setting
 from sim.rollout import Rollout, RolloutResult
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
@@ -35,6 +34,9 @@ from sim.terrains.spaces.base import MAX_HEIGHT
 from sim.terrains.spaces.registry import at_height, get_space
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import GroundMaps, Terrains
+
+if TYPE_CHECKING:
+    from sim.robots.stand import Standing
 
 _APART = 0.05  # share by which speeds may differ
 _OFF = 0.1  # share of its command by which a speed may miss it
@@ -55,6 +57,8 @@ def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute,
     Without ``policy`` it walks by the controller beside its settings. If it walks badly, or with ``why``, the change of
     its contract is named with which it walks best. Returns whether nothing has to be mended.
     """
+    from sim.robots.stand import describe_model  # loads Newton, which takes seconds
+
     policy = policy or str(robot.policy_file)
     if has_controller := policy != str(robot.policy_file) or Path(policy).exists():
         check_policy(policy, robot, compute.device)
@@ -149,8 +153,10 @@ def measure_stray(robot: RobotCfg, policy: str, device: str) -> float:
     return float(np.quantile(np.concatenate(errors), _STRAY_SHARE))
 
 
-def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> Standing:
+def _stand_with_room(robot: RobotCfg, device: str, seconds: float) -> "Standing":
     """Stands the robot with room for the dropped ones' contacts, which is written into settings that are data."""
+    from sim.robots.stand import stand
+
     tried = robot
     while (standing := stand(tried, device=device, seconds=seconds)).overflowed:
         if tried.nconmax >= _MAX_CONTACTS:

@@ -1,6 +1,7 @@
 """Parallel robots on height grids, one world each: Newton's MuJoCo model, contact, steps and rewards of our own."""
 
 import gc
+import importlib
 import math
 from collections.abc import Callable, Collection
 from dataclasses import asdict
@@ -34,6 +35,24 @@ from sim.solver import StockDynamics, make_dynamics
 from sim.terrains.bank import TerrainBank
 from sim.terrains.conditions.kinds import MAX_LATENCY_S, condition_effects
 from sim.terrains.conditions.perception import MAX_MAP_DELAY_S
+
+_SET_UP = ("newton._src.solvers.mujoco.kernels", "newton._src.geometry.bvh", "mujoco_warp._src.set_const")
+"""Modules with many kernels that run when a simulation is built, and never again."""
+_NEEDED_LAST = (
+    *(f"kernels.{name}" for name in ("heightfield", "super_gaussian", "queue", "contact", "coordinates", "episode")),
+    *("kernels.observation", "mujoco_warp._src.smooth"),
+)
+"""Modules of kernels in the opposite order of that in which a simulation takes them."""
+
+if not wp.is_cuda_available():
+    for _name in _SET_UP:  # the same numbers, in a third of the time
+        wp.set_module_options({"optimization_level": 0}, module=importlib.import_module(_name))
+
+
+def load_kernels(device: str) -> None:
+    """Load the kernels that a simulation takes last, while another process compiles those that it takes first."""
+    for name in _NEEDED_LAST:
+        wp.load_module(name, device=device)
 
 
 class Simulation:

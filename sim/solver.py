@@ -168,7 +168,7 @@ class Dynamics:
                 dof_actuator=wp.array(actuator, dtype=int),
                 roots=wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int),
             )
-            spilled = wp.zeros((d.nworld, max(1, self._sizes.global_floats)), dtype=float)
+            spilled = wp.zeros((d.nworld, sizes.global_floats(contacts.shape.shape[1])), dtype=float)
             slope = wp.zeros((d.nworld, m.nv), dtype=float)
         ours = {"contacts": contacts, "surfaces": surfaces, "spilled_contacts": spilled}
         self._problem = make_struct(Problem, model, m.opt, d, **ours)
@@ -252,7 +252,6 @@ def make_dynamics(
     tree = TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(_levels(m)[1]) - 1)
     sizes = Sizes(
         dofs=m.nv,
-        contacts=contacts.shape.shape[1],
         dimensions=max(3, int(m.nmaxcondim)),
         inertia=m.M_colind.shape[0],
         losses=bool((m.dof_frictionloss.numpy() > 0.0).any()),

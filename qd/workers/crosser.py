@@ -33,6 +33,7 @@ from sim.terrains.terrains import Terrains
 _LOT_EPISODES = {"cuda": 16_384, "cpu": 20}  # of a worker; two lots are under way
 _LOT_TERRAINS = 3_200  # of a worker at most: their height maps take 600 MB
 _MUJOCO_C_LOT = 4  # terrains of a process
+_COMPILERS = 2  # processes that compile kernels
 
 
 @contextmanager
@@ -46,12 +47,14 @@ def open_pipeline(cfg: PipelineCfg, *, build: Build = build_simulator) -> Iterat
     else:
         processes: list[WorkerProcess] = []
         with ExitStack() as stack:
-            for _ in range(cfg.num_workers):
-                processes.append(WorkerProcess(cfg.terrains_of_worker, build, cfg))
+            for number in range(cfg.num_workers):
+                if number == _COMPILERS:
+                    for process in processes:
+                        process.receive()  # the others then find the kernels compiled
+                own = replace(cfg, helps_to_compile=0 < number < _COMPILERS)
+                processes.append(WorkerProcess(cfg.terrains_of_worker, build, own))
                 stack.callback(processes[-1].stop)
-                if len(processes) == 1:
-                    processes[0].receive()  # it compiles the kernels; the others then find them compiled
-            for process in processes[1:]:
+            for process in processes[_COMPILERS if cfg.num_workers > _COMPILERS else 0 :]:
                 process.receive()
             yield ProcessPipeline(processes, cfg.num_terrains)
 

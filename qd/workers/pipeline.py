@@ -60,6 +60,8 @@ class PipelineCfg:
     """Whether the training task's reward is summed too, for which robots go on after the goal."""
     record: bool = False
     """Whether results have the frames of all episodes."""
+    helps_to_compile: bool = False
+    """Whether another process compiles kernels at the same time, so that this one begins with those needed last."""
 
     def __post_init__(self) -> None:
         if self.on_mujoco_c and (self.reward or self.penalties_from_s or self.record):
@@ -138,8 +140,10 @@ def build_simulator(cfg: PipelineCfg, num_terrains: int) -> Simulator:
         robot, solver = resolved(robot)
     if cfg.on_mujoco_c:
         return MujocoC(robot, cfg.policy, replicas=cfg.replicas, solver=solver)
-    import sim.simulation  # noqa: F401  Newton keeps the frames that first import it, and a simulation in them
+    import sim.simulation  # Newton keeps the frames that first import it, and a simulation in them
 
+    if cfg.helps_to_compile:
+        sim.simulation.load_kernels(cfg.compute.device)
     rollout = Rollout(
         robot,
         cfg.policy,

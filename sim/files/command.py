@@ -92,6 +92,8 @@ class EliteFlags(SpaceFlag):
     --elite has them; all are those that have one."""
 
 
+_EXTRAS = {"rsl_rl": "train", "tensordict": "train", "tensorboard": "train", "onnx": "onnx", "onnxruntime": "onnx"}
+"""Extras of pyproject.toml by the modules of theirs that are imported; what searches and shows needs none."""
 BEGAN = time.monotonic()  # when the program began [s]
 
 
@@ -143,7 +145,7 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
             for stream, _ in closed:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
             return 1
-        remedy = _cache_remedy(error)
+        remedy = _find_remedy(error)
         if debugging() or not (remedy or isinstance(error, (ValueError, OSError, FloatingPointError, UserError))):
             traceback.print_exc()
             return 2
@@ -157,8 +159,10 @@ def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
         return 130
 
 
-def _cache_remedy(error: Exception) -> str:
-    """The remedy if Warp's or numba's cache of compiled code is damaged or cannot be written; else an empty text."""
+def _find_remedy(error: Exception) -> str:
+    """The remedy for a missing package, and for a cache of compiled code of Warp or numba; else an empty text."""
+    if isinstance(error, ModuleNotFoundError) and (extra := _EXTRAS.get(str(error.name))):
+        return f": `make setup` installs all packages, and pip install 'faultline[{extra}]' those that are missing"
     folder = Path(os.environ.get("WARP_CACHE_PATH") or Path.home() / ".cache" / "warp").absolute()
     if re.search(r"Failed to load (CPU|CUDA) module", str(error)):
         return f": the compiled kernels in {folder} are damaged: remove that folder, they are compiled again"

@@ -19,9 +19,7 @@ from sim.files.atomic import write_atomically
 from sim.files.settings import check_settings, from_builtins, read_toml, to_toml
 from sim.robots.actuator_net import ActuatorNet
 from sim.robots.compiled import PER_JOINT, RobotFile, file_problems, joint_names, mj, read_robot_file
-from sim.robots.model import make_builder
 from sim.robots.model_files import find_model, read_model_files
-from sim.robots.probes import make_probes, measure_extents, start_height
 from sim.robots.robot import ROBOTS, RobotCfg, needed_senses
 
 _ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
@@ -40,6 +38,9 @@ def is_new_name(name: str) -> bool:
 
 def load_robot(path: Path) -> RobotCfg:
     """Reads a settings file, or runs one that is Python, and checks the robot that it sets against its model."""
+    from sim.robots.model import make_builder  # loads Newton, which takes seconds, as in all of this file
+    from sim.robots.probes import make_probes, start_height
+
     file = path.resolve()  # of a link, the model lies beside what it points to
     robot = _read_toml(path, file) if path.suffix == ".toml" else getattr(run_file(path), "ROBOT", None)
     if type(robot) is not RobotCfg:
@@ -116,6 +117,9 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     decide the senses, and joints that it does not move are arm joints. ``given`` has one value a joint where a setting
     is of joints.
     """
+    from sim.robots.model import make_builder
+    from sim.robots.probes import measure_extents
+
     model = robot_file.model
     nearest = np.where(model.jnt_limited[1:] == 1, np.clip(0.0, *model.jnt_range[1:].T), 0.0).tolist()
     pose = given.get("default_joint_pos", robot_file.home or nearest)

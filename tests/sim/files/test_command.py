@@ -26,6 +26,7 @@ ERRORS = {  # what is raised, the exit status, and the line on stderr, or what i
     "resumable": (Interrupted("Stopped; 3 saved"), 130, "^\nStopped; 3 saved\n$"),
     "kernels": (Exception("Failed to load CPU module 'x'"), 2, "/cache/warp .*remove"),
     "cache": (OSError(13, "Permission denied", "/cache/warp/x"), 2, "/cache/warp: .*WARP_CACHE_PATH"),
+    "package": (ModuleNotFoundError("No module named 'onnx'", name="onnx"), 2, r"make setup.*faultline\[onnx\]"),
     "file at home": (OSError(2, "No such file", IMAGE), 2, f"No such file: '{IMAGE}'\n$"),
     "bug": (ZeroDivisionError(), 0, ""),
 }
