@@ -27,7 +27,7 @@ LANES = 32
 _REGISTERS = 96  # a thread, so that 20 robots fit on a multiprocessor
 _CHUNK = 4  # contacts whose terms of the Hessian are summed at once
 _SHARED_FLOATS = 1792  # a robot, so that 32 robots fit; further contacts are in global memory
-_MIN_SHARED_CONTACTS = 8
+_MIN_SHARED_CONTACTS = 7
 _BODY = Path(__file__).with_suffix(".cu")
 
 
