@@ -114,12 +114,12 @@ def test_sigterm_in_the_midst_of_compiling_is_not_lost():
     assert 0.05 < time.monotonic() - began < 20
 
 
-def test_a_bug_has_its_traceback_and_so_has_every_error_for_debugging(monkeypatch):
-    with pytest.raises(ZeroDivisionError):
-        run("--how", "bug")
+def test_a_bug_has_its_traceback_and_so_has_every_error_for_debugging(monkeypatch, capsys):
+    assert run("--how", "bug") == 2
+    assert "Traceback" in (err := capsys.readouterr().err) and "ZeroDivisionError" in err
     monkeypatch.setenv("FAULTLINE_DEBUG", "1")
-    with pytest.raises(ValueError, match="two"):
-        run("--how", "value")
+    assert run("--how", "value") == 2
+    assert "Traceback" in (err := capsys.readouterr().err) and "two" in err
 
 
 @pytest.mark.parametrize("flag", ["--how=end", "--how=now", "--help"])
