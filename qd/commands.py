@@ -1,7 +1,7 @@
 """The commands of searching and evaluating: their flags, and nothing else."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -373,9 +373,12 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         """Whether a gate says no."""
         from qd.evaluate.gate import publish_gate
 
-        sets = {"pack": self.pack, "fail_under": self.fail_under, "sets": self.sets, "archive": self.archive}
-        sets |= {"independent": self.independent, "space": self.space, "terrains": self.terrains}
-        if given := [name for name, value in (sets | {"episodes": self.episodes}).items() if value]:
+        defaults = {field.name: field.default for field in fields(self)}
+        own = ("gate", "junit", "out", "robot", "policy", "policies", "device", "workers", "num_envs")
+        given = [name for name, value in vars(self).items() if name not in own and value != defaults[name]]
+        if self.policies and self.policy is not None:
+            given.append("policy")
+        if given:
             flags = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise ValueError(f"--gate says in its file what is crossed, got {flags} too: leave that out")
         robot = get_robot(self.robot)

@@ -181,7 +181,7 @@ class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
 
     It begins with what the robot fails, and shows the worst terrains close up at the moment of failure, with another
     controller beside that passes them. For this robots try these terrains again, 20 times each, which is stored: the
-    same command goes on after a stop.
+    same command goes on after a stop. With --evidence the page is about what was tested of a controller.
     """
 
     run: Path | None = None
@@ -194,7 +194,7 @@ class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
     """How many of the worst terrains to show close up, one a cause first."""
     tables: Path | None = None
     """Tables of an evaluation to show, such as results/anymal/tables.json; none if left out."""
-    evidence: tuple[Path, ...] = ()
+    evidence: tuple[Path, ...] | None = None
     """In place of a run, files that gates, doses, rates, tests on packs and searches (archive.json) wrote about one
     controller: a page of what was tested, by which command, and what was not; evidence.html beside the first file."""
     controller: str | None = None
@@ -204,13 +204,15 @@ class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
 
     def execute(self) -> None:
         """Writes the page."""
-        if self.evidence or self.verify is not None:
+        if self.evidence is not None or self.verify is not None:
+            if (self.evidence is not None and self.verify is not None) or self.evidence == ():
+                raise ValueError("report takes files behind --evidence, or a list behind --verify, got none or both")
             from qd.show.report.evidence import verify_evidence, write_evidence
 
             if self.verify is not None:
                 count = verify_evidence(self.verify)
                 print(f"{count} files are as {self.verify} says. That does not say who wrote them.")
-            else:
+            elif self.evidence is not None:
                 write_evidence(self.evidence, robot=self.robot, controller=self.controller, out=self.out)
             return
         from qd.show.report.report import write_report

@@ -44,7 +44,7 @@ def resolve_robot(record: Mapping[str, Any], given: str | RobotCfg | None, file:
         raise ValueError(f"{file} is of robot '{name}', which is not shipped: name its settings file too, by --robot")
     robot = ROBOTS[name] if given is None else get_robot(given)
     if robot.name != name:
-        raise ValueError(f"{file} is of {name}, got --robot {given}: give that robot or another {kind}")
+        raise ValueError(f"{file} is of {name}, got robot {robot.name}: give that robot or another {kind}")
     check_robot_identity(record, robot, file, "make it anew")
     return robot
 

@@ -18,9 +18,8 @@ from qd.faults.judge import STAGES
 from qd.show.report.page import Table, check_page, origin_rows, publish_page
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.intervals import format_value
-from sim.robots.find import get_robot
-from sim.robots.robot import RobotCfg
-from sim.terrains.conditions.kinds import CONDITIONS
+from sim.robots.find import resolve_robot
+from sim.terrains.conditions.kinds import CONDITIONS, GROUPS
 
 SAFE_RATE = 0.9
 """A size of an obstacle is within the limits of use if the goal rate's 95 % interval lies above this, at all smaller
@@ -44,15 +43,26 @@ _COUNTS = {
 }
 
 
-def find_kind(content: Mapping[str, Any], file: Path) -> str:
-    """What a file of numbers is: a key of the kinds that evidence is made of."""
-    for kind, (key, _) in _KINDS.items():
-        if key in content:
-            return kind
-    raise ValueError(f"{file} must be written by a gate, dose, rates, pack or search, got another file: leave it out")
+def read_numbers(file: Path) -> tuple[str, dict[str, Any]]:
+    """What a file of numbers is, a key of the kinds that evidence is made of, and its content."""
+    if not file.is_file():
+        raise FileNotFoundError(f"no file at {file}: give one that a gate, dose, rates, pack or search wrote")
+    content = read_json(file)
+    kinds = [kind for kind, (key, _) in _KINDS.items() if key in content]
+    needed = {
+        "robot",
+        "robot_sha256",
+        "sources_sha256",
+        "dirty",
+        "controllers" if kinds == ["dose"] else "policy_sha256",
+    }
+    if not kinds or not needed <= {*content} or "\n" in str(file):
+        rule = "must be written by a gate, dose, rates, pack or search"
+        raise ValueError(f"{file} {rule}, got another file: leave it out")
+    return kinds[0], content
 
 
-def tested_hash(content: Mapping[str, Any], kind: str, name: str | None) -> str | None:
+def tested_hash(kind: str, content: Mapping[str, Any], name: str | None) -> str | None:
     """SHA-256 of the controller that a file is about; of a dose the one of that ``name``, or the only one."""
     if kind != "dose":
         return content["policy_sha256"]
@@ -83,7 +93,13 @@ def dose_limits(content: Mapping[str, Any], controller: str, speed: float) -> li
 def describe(content: Mapping[str, Any], kind: str, controller: str, speed: float) -> tuple[str, Table]:
     """Title and table of a file's numbers."""
     if kind == "gate":
-        return "Gate", Table(("", "verdict", "why"), [row[:3] for row in to_rows(content)])
+        rates = {}
+        for check in content["checks"]:
+            invalid = f", {check['invalid_episodes']} invalid" if check["invalid_episodes"] else ""
+            rate = format_value(check["goal_rate"]["new"], check["goal_interval"])
+            rates[check["name"]] = f"{rate} of {check['episodes']} episodes{invalid}"
+        rows = [(name, verdict, why, rates.get(name, "")) for name, verdict, why, _ in to_rows(content)]
+        return "Gate", Table(("", "verdict", "why", "goal rate"), rows)
     if kind == "dose":
         physics = "finer physics" if content["resolved"] else "the search's physics"
         return f"Limits of use, with {physics}", Table((), dose_limits(content, controller, speed))
@@ -100,17 +116,17 @@ def describe(content: Mapping[str, Any], kind: str, controller: str, speed: floa
 
 def list_untested(contents: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:
     """What the files say nothing of."""
-    kinds = {kind for kind, _ in contents}
-    untested = [
-        "a real robot: all episodes are simulated",
-        *(why for kind, (_, why) in _KINDS.items() if kind not in kinds),
-    ]
-    spaces = "+".join(str(content.get("space", "")) for _, content in contents)
-    spaces += "+".join(check["settings"]["space"] or "" for _, c in contents for check in c.get("checks", ()))
+    checks = [check["settings"] for _, content in contents for check in content.get("checks", ())]
+    kinds = {kind for kind, _ in contents} | {"pack" if check["pack"] else "rates" for check in checks}
+    untested = ["a real robot: all episodes are simulated"]
+    untested += [why for kind, (_, why) in _KINDS.items() if kind not in kinds]
+    spaces = [content.get("space") for _, content in contents] + [check["space"] for check in checks]
+    parts = {part for space in spaces if space for part in space.split("+")[1:]}
+    crossed = {*parts, *(name for group in parts & {*GROUPS} for name in GROUPS[group])}
     dosed = {row["element"] for kind, content in contents if kind == "dose" for row in content["dose"]}
-    if dosed and (lacking := [name for name in all_doses() if name not in dosed]):
-        untested.append(f"other obstacles and conditions than those above: {', '.join(lacking)}")
-    if lacking := [name for name in CONDITIONS if name not in spaces and name not in dosed]:
+    if dosed and (lacking := [name for name in all_doses() if name not in dosed and name not in CONDITIONS]):
+        untested.append(f"other obstacles alone: {', '.join(lacking)}")
+    if lacking := [name for name in CONDITIONS if name not in crossed | dosed]:
         untested.append(f"conditions: {', '.join(lacking)}")
     judged = {stage for kind, content in contents if kind == "search" for stage in content.get("judged_by", {})}
     if "search" in kinds and (lacking := [name for name in STAGES if name not in judged]):
@@ -129,24 +145,28 @@ def write_evidence(
         controller: Its name in files of doses; their first if None.
         out: The page, *.html; evidence.html beside the first file if None.
     """
-    contents = [(find_kind(content, file), content) for file in files for content in [read_json(file)]]
-    tested: RobotCfg = get_robot(robot or contents[0][1]["robot"])
-    about = {(content["robot_sha256"], tested_hash(content, kind, controller)) for kind, content in contents}
-    if len(about) != 1:
-        listed = ", ".join(
-            f"{file} of {str(tested_hash(c, k, controller))[:12]}" for file, (k, c) in zip(files, contents, strict=True)
-        )
-        raise ValueError(f"evidence must be about one controller of one robot, got {listed}: leave the others out")
+    contents = [read_numbers(file) for file in files]
+    tested = [resolve_robot(content, robot, file, "file") for file, (_, content) in zip(files, contents, strict=True)]
+    about = [
+        (content["robot_sha256"], tested_hash(*numbers, controller)) for numbers in contents for content in numbers[1:]
+    ]
+    if len({*about}) != 1 or about[0][1] is None:
+        listed = ", ".join(f"{file} of {str(digest)[:12]}" for file, (_, digest) in zip(files, about, strict=True))
+        rule = "evidence must be about one controller of one robot, known by its file's hash"
+        raise ValueError(f"{rule}, got {listed}: leave the others out, or name it by --controller")
     out = out or files[0].with_name("evidence.html")
     check_page(out)
-    for suffix in (".json", ".sha256"):
-        prepare_output(out.with_suffix(suffix))
+    written = [out.with_suffix(suffix) for suffix in (".html", ".json", ".sha256")]
+    if taken := {file.resolve() for file in files}.intersection(file.resolve() for file in written):
+        raise ValueError(f"out must not replace what it is made of, got {out} and {min(taken).name}: name another page")
+    for file in written:
+        prepare_output(file)
     names = [os.path.relpath(file, out.parent) for file in files]
     hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
     parts = []
     for (kind, content), name, digest in zip(contents, names, hashes, strict=True):
         label = controller or (next(iter(content["controllers"])) if kind == "dose" else "")
-        title, table = describe(content, kind, label, tested.speed)
+        title, table = describe(content, kind, label, tested[0].speed)
         origin = [
             ("file", name),
             ("sha256", digest),
@@ -154,10 +174,12 @@ def write_evidence(
             ("sources_sha256", content["sources_sha256"]),
         ]
         origin += [("changed", "sources differed from the commit")] if content["dirty"] else []
+        origin += [("gate_sha256", content["gate_sha256"]), ("error", content["error"])] if kind == "gate" else []
+        origin += [("terrains_sha256", check["terrains_sha256"]) for check in content.get("checks", ())]
         parts.append({"title": title, "table": table._asdict(), "origin": origin})
-    robot_sha256, policy_sha256 = about.pop()
+    robot_sha256, policy_sha256 = about[0]
     evidence = {
-        "robot": tested.name, "robot_sha256": robot_sha256, "policy_sha256": policy_sha256, "speed": tested.speed,
+        "robot": tested[0].name, "robot_sha256": robot_sha256, "policy_sha256": policy_sha256, "speed": tested[0].speed,
         "safe_rate": SAFE_RATE, "parts": parts, "not_tested": list_untested(contents),
     }  # fmt: skip
     publish_page(out, "evidence.html", **evidence)
@@ -171,9 +193,10 @@ def write_evidence(
 
 def verify_evidence(file: Path) -> int:
     """How many files are as a list of hashes says; a ValueError names those that are not."""
-    lines = file.read_text(encoding="utf-8").splitlines()
-    rows = [match.groups() for line in lines if (match := re.fullmatch(r"([0-9a-f]{64}) [ *](.+)", line))]
-    if not rows or len(rows) < len(lines):
+    lines = file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
+    rows = [match.groups() for line in lines if (match := re.fullmatch(r"([0-9a-fA-F]{64}) [ *](.+)", line))]
+    own = {file.with_suffix(suffix).name for suffix in (".html", ".json")}
+    if not rows or len(rows) < len(lines) or not own <= {name for _, name in rows}:
         raise ValueError(
             f"{file} must be a list of SHA-256, as `faultline report --evidence` writes it: give that file"
         )
@@ -182,8 +205,8 @@ def verify_evidence(file: Path) -> int:
         path = file.parent / name
         if not path.is_file():
             wrong.append(f"{name} is gone")
-        elif hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+        elif hashlib.sha256(path.read_bytes()).hexdigest() != digest.lower():
             wrong.append(f"{name} was changed")
     if wrong:
-        raise ValueError(f"{file} does not hold: {', '.join(wrong)}")
+        raise ValueError(f"{file} does not hold: {', '.join(wrong)}: make the evidence anew, or put copies back")
     return len(rows)

@@ -12,7 +12,8 @@ import pytest
 import yaml
 from scipy.stats import norm
 
-from qd.evaluate.gate import GateProcess, PairedTest, RateTest, publish_gate, read_gate
+from qd.evaluate.gate import GateProcess, publish_gate, read_gate
+from qd.evaluate.sequential import PairedTest, RateTest, rate_interval
 from sim.files.command import run_command
 from tests.docs import ROOT
 from tests.qd.robots import Robots
@@ -85,13 +86,29 @@ def test_an_interval_holds_whenever_it_is_looked_at():
     """In at most 5 % of 300 packs it ever leaves the mean out, three standard errors allowed for."""
     rng, missed = np.random.default_rng(3), 0
     for rates in rates_of(rng, 0.8, 300):
-        test, outside = RateTest(0.5, 0.1, 0.05), False
-        for _ in range(20):
-            test.add(int((rng.random(TERRAINS) < rates).sum()), TERRAINS)
-            low, high = test.interval()
+        goals, outside = 0, False
+        for number in range(1, 21):
+            goals += int((rng.random(TERRAINS) < rates).sum())
+            low, high = rate_interval(goals, number * TERRAINS)
             outside |= not low <= 0.8 <= high
         missed += outside
     assert missed <= 300 * 0.05 + 3 * np.sqrt(300 * 0.05 * 0.95)
+
+
+@pytest.mark.parametrize(("goals", "count"), [(0, 20), (20, 20), (3999, 4000), (1, 100_000)])
+def test_an_interval_has_the_rate_in_it(goals, count):
+    low, high = rate_interval(goals, count)
+    assert 0.0 <= low <= goals / count <= high <= 1.0 and low < high
+
+
+def test_a_rate_is_measured_against_the_limit_itself():
+    """Between limit and limit + margin a rate passes, however far the likelihoods of both ends are apart."""
+    test = RateTest(0.94, 0.05, 0.05)
+    test.add(3800, 4000)
+    assert test.passes is True
+    test = RateTest(0.1, 0.09, 0.05)
+    test.add(280, 4000)
+    assert test.passes is False and test.decide()[0] is False
 
 
 @pytest.fixture
@@ -128,7 +145,7 @@ def test_a_good_controller_passes_and_a_bad_one_fails(anymal, work, monkeypatch)
     suite = ElementTree.parse("junit.xml").getroot()[0]
     assert [case.get("name") for case in suite.iter("testcase")] == ["level ground", "hard_random"]
     assert (suite.get("tests"), suite.get("failures")) == ("2", "0") and "passes" in summary.read_text()
-    report = pass_gate(anymal, f"{CHECK}limit = 0.9\n", share_arrives(0.6), junit=Path("junit.xml"))
+    report = pass_gate(anymal, f"{CHECK}limit = 0.9\n", share_arrives(0.3), junit=Path("junit.xml"))
     assert not report["passes"] and json.loads(Path("out/g.json").read_text())["passes"] is False
     suite = ElementTree.parse("junit.xml").getroot()[0]
     (failure,) = suite.iter("failure")
@@ -169,6 +186,10 @@ def test_a_controller_that_does_not_walk_fails_and_is_asked_no_further(anymal, w
         ('[[check]]\nset = "elites"\n', "hand_crafted"),
         ('[[check]]\npack = "anymal"\nspace = "course"\n', "space"),
         (f"{CHECK}limit = 0.97\n", "margin"),
+        (f"{CHECK}limit = 0.95\n", "margin"),
+        ('[[check]]\nset = "hand_crafted"\nspace = "super_gaussian+noise"\n', "space"),
+        (2 * f"{CHECK}limit = 0.5\n", "twice"),
+        (f'{CHECK}limit = 0.5\nname = "a\\u0001"\n', "name"),
         (f"{CHECK}limits = 0.9\n", "limits"),
         (f"error = 0.7\n{CHECK}limit = 0.5\n", "error"),
         ("check = 3\n", "check"),

@@ -90,6 +90,12 @@ def test_evidence_is_about_one_controller(files):
         write_evidence(files, controller="C-G")
     with pytest.raises(ValueError, match=r"other\.json"):
         write_evidence([*files, write("other.json", policy_sha256="aa")])
+    with pytest.raises(ValueError, match="not shipped"):  # no code runs that only a file names
+        write_evidence([write("evil.json", policy_sha256="aa", robot="evil.py", hand_crafted={})])
+    with pytest.raises(ValueError, match="one controller"):
+        write_evidence([write("none.json", policy_sha256=None, hand_crafted={})])
+    with pytest.raises(ValueError, match="replace"):
+        write_evidence(files, out=Path("archive.html"))
     assert not Path("numbers/evidence.html").exists()
     Path("list").write_text("no hashes\n")
     with pytest.raises(ValueError, match="SHA-256"):
