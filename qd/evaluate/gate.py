@@ -31,13 +31,12 @@ from qd.workers.crosser import Crosser
 from sim.controllers.spec import controller_identity, crosser_name
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
-from sim.files.npz import npz_bytes
 from sim.files.settings import NonNegativeInt, from_builtins, read_toml
 from sim.rates import MAX_INVALID_SHARE
 from sim.robots.find import resolve_robot
 from sim.robots.robot import RobotCfg
 from sim.terrains.bank import make_heights
-from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS, SPACING
+from sim.terrains.maps.terrain_files import ExportedTerrain, encode_terrain
 from sim.terrains.spaces.registry import load_space, space_at
 from sim.terrains.terrains import Terrains
 
@@ -48,7 +47,6 @@ Name = Annotated[str, Meta(max_length=80, pattern=r"^[^\x00-\x1f|<>&`]*$")]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 _SETS = ("hand_crafted", "hard_random")
 _SEED_KEY = 20261130  # with seed, check and round, the entropy of a round's episodes, and of nothing else
-_SIZE_M = SPACING * np.array([NUM_COLS - 1, NUM_ROWS - 1])
 _SAVED = 3  # terrains of a check
 _AT_ONCE = 2_000  # episodes between two looks on a GPU, which many robots keep busy; on the CPU it is a round
 
@@ -122,11 +120,12 @@ def draw_round(terrains: Terrains, seed: int, check: int, number: int) -> Terrai
     return Terrains(**{**vars(terrains), "seeds": sequence.generate_state(count).astype(np.uint32)})
 
 
-def check_terrains(check: CheckCfg, seed: int, robot: RobotCfg, folder: Path) -> tuple[Terrains, list[Entry], str]:
-    """Terrains of a check, what a pack says of them (nothing of others), and their SHA-256.
+CheckTerrains = tuple[Terrains, list[Entry], str]
+"""Terrains of a check, what a pack says of them (nothing of others), and their SHA-256."""
 
-    ``folder`` is where paths of packs begin.
-    """
+
+def check_terrains(check: CheckCfg, seed: int, robot: RobotCfg, folder: Path) -> CheckTerrains:
+    """Draws or reads the terrains of a check; ``folder`` is where paths of packs begin."""
     if not check.pack:
         space = space_at(load_space(check.space), None, robot)
         terrains = plain_set(check.set, check.terrains, seed, space).terrains
@@ -138,12 +137,12 @@ def check_terrains(check: CheckCfg, seed: int, robot: RobotCfg, folder: Path) ->
 
 
 def run_check(
-    check: CheckCfg, drawn: tuple[Terrains, list[Entry], str], number: int, cfg: GateCfg,
+    check: CheckCfg, drawn: CheckTerrains, number: int, cfg: GateCfg,
     policies: Mapping[str, str], crosser: Crosser,
 ) -> dict[str, Any]:  # fmt: skip
     """Crosses rounds until each test is clear: verdicts, counts and terrains that ``new`` fails, as JSON values.
 
-    ``drawn`` is of :func:`check_terrains`. Invalid episodes are counted, and left out of rates and pairs.
+    Invalid episodes are counted, and left out of rates and pairs.
     """
     began = time.perf_counter()
     terrains, known, digest = drawn
@@ -216,12 +215,15 @@ def run_check(
     }
 
 
-def run_gate(file: Path, robot: RobotCfg, policies: Mapping[str, str], compute: Compute) -> dict[str, Any]:
+def run_gate(
+    file: Path, cfg: GateCfg, drawn: Sequence[CheckTerrains], robot: RobotCfg, policies: Mapping[str, str],
+    compute: Compute,
+) -> dict[str, Any]:  # fmt: skip
     """Runs the checks of a gate.toml on the controller ``new`` of ``policies``, against ``old`` if there is one.
 
-    A controller that does not cross level ground fails, and is not asked further. Returns JSON values.
+    ``cfg`` are the file's settings, ``drawn`` the terrains of each check. A controller that does not cross level ground
+    fails, and is not asked further. Returns JSON values.
     """
-    cfg = read_gate(file)
     if lone := [check.title for check in cfg.check if check.limit is None and "old" not in policies]:
         rule = "a check without a limit is of old against new"
         raise ValueError(f"{rule}, got {lone[0]} and no old controller: give one")
@@ -233,7 +235,6 @@ def run_gate(file: Path, robot: RobotCfg, policies: Mapping[str, str], compute: 
         "old": controller_identity(robot, policies["old"]) if "old" in policies else None,
         "gate_sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
     }
-    drawn = [check_terrains(check, cfg.seed, robot, file.resolve().parent) for check in cfg.check]
     with Crosser(robot, compute, cache=crossings_folder(robot)) as crosser:
         level = measure_level_ground(crosser, policies["new"])["searched"]
         walks = level["goal"] >= MIN_GOAL_RATE
@@ -313,25 +314,22 @@ def to_markdown(report: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "", error, ""])
 
 
-def save_failing(report: Mapping[str, Any], gate: Path, robot: RobotCfg, folder: Path) -> None:
+def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], folder: Path) -> None:
     """Writes some terrains of each failed check as height maps, which `faultline film --terrain` takes.
 
     Those that old crosses come first. Terrains with ground or conditions, which a map does not have, are left out.
     """
     for old in folder.glob("*.npz"):
         old.unlink()
-    cfg = read_gate(gate)
-    for number, (check, found) in enumerate(zip(cfg.check, report["checks"], strict=False), 1):
-        space = load_space(check.space)
-        if found["passes"] or space.has_conditions or space.ground:
+    for number, (found, (terrains, _, _)) in enumerate(zip(report["checks"], drawn, strict=False), 1):
+        if found["passes"] or terrains.space.has_conditions or terrains.space.ground:
             continue
-        terrains, _, _ = check_terrains(check, cfg.seed, robot, gate.resolve().parent)
         failing = sorted(found["failing"], key=lambda row: (-row.get("old_goals", 0), row["goals"] / row["episodes"]))
         heights = terrains.heights if terrains.heights is not None else make_heights(terrains.values, terrains.space)
         for row in (row["terrain"] for row in failing[:_SAVED]):
             file = folder / f"check-{number}-terrain-{row}.npz"
             prepare_output(file)
-            write_atomically(file, npz_bytes({"heights": heights[row], "size_m": _SIZE_M}))
+            write_atomically(file, encode_terrain(ExportedTerrain(heights=heights[row]), "npz"))
 
 
 def publish_gate(
@@ -355,10 +353,13 @@ def publish_gate(
     writers |= {} if junit is None else {junit: to_junit}
     for path in writers:
         prepare_output(path)
-    report = publish(out, lambda: run_gate(file, robot, policies, compute), lambda found: print(to_markdown(found)))
+    cfg = read_gate(file)
+    drawn = [check_terrains(check, cfg.seed, robot, file.resolve().parent) for check in cfg.check]
+    asked = (file, cfg, drawn, robot, policies, compute)
+    report = publish(out, lambda: run_gate(*asked), lambda found: print(to_markdown(found)))
     for path, write in writers.items():
         write_atomically(path, write(report))
-    save_failing(report, file, robot, out.with_suffix(""))
+    save_failing(report, drawn, out.with_suffix(""))
     if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
         try:
             with open(summary, "a", encoding="utf-8") as step:

@@ -90,7 +90,7 @@ def dose_limits(content: Mapping[str, Any], controller: str, speed: float) -> li
     return limits
 
 
-def describe(content: Mapping[str, Any], kind: str, controller: str, speed: float) -> tuple[str, Table]:
+def tabulate(content: Mapping[str, Any], kind: str, controller: str, speed: float) -> tuple[str, Table]:
     """Title and table of a file's numbers."""
     if kind == "gate":
         rates = {}
@@ -166,7 +166,7 @@ def write_evidence(
     parts = []
     for (kind, content), name, digest in zip(contents, names, hashes, strict=True):
         label = controller or (next(iter(content["controllers"])) if kind == "dose" else "")
-        title, table = describe(content, kind, label, tested[0].speed)
+        title, table = tabulate(content, kind, label, tested[0].speed)
         origin = [
             ("file", name),
             ("sha256", digest),
