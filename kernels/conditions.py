@@ -15,6 +15,7 @@ from typing import Any
 
 import warp as wp
 
+from kernels.coordinates import SolverState, read_pose
 from kernels.episode import Episodes
 from kernels.heightfield import Terrain
 from kernels.launch import kernel_over
@@ -54,6 +55,8 @@ class VariedRobots:
     """Physics steps after which a target counts, shape (num_envs,)."""
     friction: wp.array[float]
     """Factor of all friction on a terrain, shape (num_terrains,)."""
+    is_misled: wp.array[int]
+    """Whether the height scan reads a wrong map, shape (num_envs,)."""
 
 
 @wp.struct
@@ -66,8 +69,6 @@ class Disturbed:
     """Half widths of legged_gym's noise, shape (observation_size,)."""
     former: wp.array3d[float]
     """Observations of the last control steps, shape (num_envs, 1 + max_lag_steps, observation_size)."""
-    age: wp.array2d[int]
-    """Observations since the episode began, shape (num_envs, observation_size): each column counts for itself."""
     steps: wp.array[int]
     """Physics steps since the episode began, shape (num_envs,)."""
     map_pose: wp.array2d[wp.spatial_vector]
@@ -76,6 +77,8 @@ class Disturbed:
     """Drift of the map over its size, of this control step and the next in turns, shape (num_envs, 2)."""
     held: wp.array2d[float]
     """Height of the base over the ground as each scan point last had it [m], shape (num_envs, num_scan_points)."""
+    is_misled: wp.array[int]
+    """That of :class:`VariedRobots`."""
 
 
 @wp.struct
@@ -125,6 +128,12 @@ class ForcedStep:
 
 
 @wp.func
+def age_of(step: DisturbedStep, env: int) -> int:
+    """Control steps since the episode began."""
+    return step.episodes.steps[env] // step.every
+
+
+@wp.func
 def push_body(step: ForcedStep, env: int, body: int, force: wp.vec3):
     """Add a force [N], world frame, at the mass centre of a body."""
     wxyz = step.xquat[env, body]
@@ -159,8 +168,6 @@ def make_begin(effects: Effects) -> Callable[..., None]:
         t = terrain_of_env[env]
         for k in range(conditions.shape[1]):
             disturbed_out.row[env, k] = conditions[t, k]
-        for k in range(disturbed_out.age.shape[1]):
-            disturbed_out.age[env, k] = 0
         disturbed_out.steps[env] = 0
         for k in range(wp.static(len(effects))):
             wp.static(effects[k][0])(robots_out, conditions[t], wp.static(effects[k][1]), t, env)
@@ -178,25 +185,40 @@ def make_disturb(effects: Effects) -> Callable[..., None]:
         env, column = wp.tid()
         for k in range(wp.static(len(effects))):
             wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env, column)
-        step.memory.age[env, column] += 1
 
     return disturb
 
 
 @cache
-def make_force(effects: Effects, *, counts: bool = True) -> Callable[..., None]:
-    """What adds forces to those that the dynamics have found, before constraints are solved; it ``counts`` the steps.
-
-    Without, what changes the joint targets in effect, before the dynamics find forces by them.
-    """
+def make_drive(effects: Effects) -> Callable[..., None]:
+    """What changes the joint targets in effect, before the dynamics find forces by them."""
 
     @kernel_over("step.memory.steps", module="unique")
-    def force(step: ForcedStep):
+    def drive(step: ForcedStep):
         """Grid (num_envs,)."""
         env = wp.tid()
         for k in range(wp.static(len(effects))):
             wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
-        if wp.static(counts):
+
+    return drive
+
+
+@cache
+def make_force(effects: Effects) -> Callable[..., None]:
+    """What adds forces to those that the dynamics have found, before constraints are solved, and counts the steps.
+
+    It reads the poses of bodies too (:func:`kernels.coordinates.poses_from_solver`): a launch of its own would take as
+    long as all that the forces take.
+    """
+
+    @kernel_over("body_q_out", module="unique")
+    def force(step: ForcedStep, solver: SolverState, body_q_out: wp.array2d[wp.transform]):
+        """Grid (num_envs, bodies_per_env)."""
+        env, body = wp.tid()
+        read_pose(solver, env, body, body_q_out)
+        if body == 0:
+            for k in range(wp.static(len(effects))):
+                wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
             step.memory.steps[env] += 1
 
     return force

@@ -154,13 +154,19 @@ def from_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> Non
     wp.launch(_from_solver_kernel, size, [solver, joint_q_out, joint_qd_out], device=joint_q_out.device)
 
 
-@kernel_over("body_q_out")
-def poses_from_solver(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
-    """Grid (num_envs, bodies_per_env): read the poses of bodies, world-local frame, from mujoco_warp's data."""
-    env, body = wp.tid()
+@wp.func
+def read_pose(solver: SolverState, env: int, body: int, body_q_out: wp.array2d[wp.transform]):
+    """Read the pose of a body, world-local frame, from mujoco_warp's data."""
     column = solver.column_of_body[body]
     turned = solver.xquat[env, column]  # wxyz
     body_q_out[env, body] = wp.transform(solver.xpos[env, column], wp.quat(turned[1], turned[2], turned[3], turned[0]))
+
+
+@kernel_over("body_q_out")
+def poses_from_solver(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
+    """Grid (num_envs, bodies_per_env): read the poses of bodies."""
+    env, body = wp.tid()
+    read_pose(solver, env, body, body_q_out)
 
 
 @wp.struct

@@ -56,8 +56,7 @@ def _base_column(step: RobotStep, env: int, k: int) -> float:
 
 
 @wp.func
-def scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: Sensors, env: int, k: int) -> float:
-    """Column ``k`` of the true height scan."""
+def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: Sensors, env: int, k: int) -> float:
     heading = base_heading(joint_q, env)
     x = joint_q[env, 0] + heading[0] * sensors.scan_x[k] - heading[1] * sensors.scan_y[k]
     y = joint_q[env, 1] + heading[1] * sensors.scan_x[k] + heading[0] * sensors.scan_y[k]
@@ -81,14 +80,16 @@ def write_observation(
     terrain_of_env: wp.array[int],
     terrain: Terrain,
     sensors: Sensors,
+    is_misled: wp.array[int],
     noise: wp.array[float],
     noise_seed: wp.array[int],
     observation_out: wp.array2d[float],
 ):
     """Grid (num_envs, observation_size): write one row an environment (columns: module docstring).
 
-    The command is in the base's yaw frame; ``noise`` are half widths of uniform noise, (observation_size,), or None;
-    ``noise_seed`` is one integer that the caller advances, shape (1,).
+    The command is in the base's yaw frame; where ``is_misled``, (num_envs,) or None, the scan is 0, for a condition to
+    add what a wrong map shows; ``noise`` are half widths of uniform noise, (observation_size,), or None; ``noise_seed``
+    is one integer that the caller advances, shape (1,).
     """
     env, k = wp.tid()
     num_joints = step.action.shape[1]
@@ -103,7 +104,9 @@ def write_observation(
     elif joint < 3 * num_joints:
         column = step.action[env, joint - 2 * num_joints]
     elif joint < 3 * num_joints + sensors.scan_x.shape[0]:
-        column = scan_column(step.joint_q, terrain, terrain_of_env[env], sensors, env, joint - 3 * num_joints)
+        if is_misled.shape[0] == 0 or is_misled[env] == 0:
+            t = terrain_of_env[env]
+            column = _scan_column(step.joint_q, terrain, t, sensors, env, joint - 3 * num_joints)
     else:
         column = _sense_column(step, sensors, env, joint - 3 * num_joints - sensors.scan_x.shape[0])
     if k < noise.shape[0]:

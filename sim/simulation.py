@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels.actuator_net import make_torques
-from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_force
+from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_drive, make_force
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
 from kernels.episode import Episodes, Outcome
@@ -266,15 +266,15 @@ class Simulation:
         assert self.bank.ground is not None
         robot = self.robot
         drives = {"drive_delay": robot.drive_delay_steps, "delay_steps": self._delay.steps}
-        self._varied = self.dynamics.vary_bases(**drives, friction=self.bank.ground.factor, physics_dt=robot.physics_dt)
-        observed = (self.num_envs, robot.observation_size)
         rows = (self.num_envs, self.bank.conditions.shape[1])
         former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)
         poses = (self.num_envs, 1 + 2 * math.ceil(MAX_MAP_DELAY_S / robot.control_dt))
         maps = {"map_pose": poses, "map_drift": (self.num_envs, 2), "held": (self.num_envs, len(self.sensors.scan_x))}
         self.disturbed = make_zeros(
-            Disturbed, self.device, row=rows, age=observed, former=former, steps=self.num_envs, **maps
+            Disturbed, self.device, row=rows, former=former, steps=self.num_envs, is_misled=self.num_envs, **maps
         )
+        drives |= {"friction": self.bank.ground.factor, "is_misled": self.disturbed.is_misled}
+        self._varied = self.dynamics.vary_bases(**drives, physics_dt=robot.physics_dt)
         self.disturbed.noise = self.make_noise(NoiseCfg())
         arms = number_arm_actuators(robot, self._coordinates.target_of_actuator.numpy() - 7)
         numbers = {"links": number_links(robot), "arm_actuators": arms, "arm_ends": number_arm_ends(robot)}
@@ -313,7 +313,8 @@ class Simulation:
         ``dt`` [s]. Noise is drawn from ``noise_seed``, (1,), and the environment's index.
         """
         where = (self.terrain_of_env, self.bank.terrain)
-        write_observation(step, *where, self.sensors, noise, noise_seed, observation)
+        is_misled = None if self.disturbed is None else self.disturbed.is_misled
+        write_observation(step, *where, self.sensors, is_misled, noise, noise_seed, observation)
         self.disturb(episodes, dt, observation)
 
     def begin_conditions(self, begins: Any) -> None:
@@ -345,15 +346,16 @@ class Simulation:
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
             to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
             if self.disturbed is not None and self.robot.arm_joints:
-                make_force(condition_effects("drive"), counts=False)(self._forced)
+                make_drive(condition_effects("drive"))(self._forced)
             if self._net is not None:
                 self._write_torques(self.joint_q, self.joint_qd, *self._net, coordinates)
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self.dynamics.find()
-            if self.disturbed is not None:
-                make_force(condition_effects("force"))(self._forced)
-            poses_from_solver(coordinates, self.body_q)
+            if self.disturbed is None:
+                poses_from_solver(coordinates, self.body_q)
+            else:
+                make_force(condition_effects("force"))(self._forced, coordinates, self.body_q)
             self.collide()
             self.dynamics.step()
             from_solver(coordinates, self.joint_q, self.joint_qd)

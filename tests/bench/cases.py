@@ -215,7 +215,9 @@ def _observation_case(scene: Scene) -> Case:
     flops = sim.num_envs * (22 * points + 100 + 3 * joints)
     return Case(
         name="observation",
-        launch=lambda: write_observation(step, sim.terrain_of_env, sim.bank.terrain, sim.sensors, None, seed, out),
+        launch=lambda: write_observation(
+            step, sim.terrain_of_env, sim.bank.terrain, sim.sensors, None, None, seed, out
+        ),
         output=out,
         counterpart=counterparts.observation,
         arguments=(*tensors, constant(*sim.base_com), constant(0.0, 0.0, -1.0), scale, SPACING),

@@ -25,7 +25,7 @@ def observe(states, command, last_action, terrain_of_env, grids, scan):
     state = {name: np.float32(array) for name, array in zip(names, (*states, command, last_action), strict=True)}
     on, seed = wp.array(terrain_of_env, dtype=int), wp.array([0], dtype=int)
     step, sensors = filled(RobotStep, base_com=BASE_COM, **state), make_sensors(num_joints, scan)
-    write_observation(step, on, make_terrain(grids), sensors, None, seed, out)
+    write_observation(step, on, make_terrain(grids), sensors, None, None, seed, out)
     return out.numpy()
 
 

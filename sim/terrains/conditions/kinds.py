@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from kernels.conditions import BASE, DisturbedStep, VariedRobots
+from kernels.conditions import BASE, DisturbedStep, VariedRobots, age_of
 from kernels.episode import Kind, Outcome
 from sim.robots.training import NoiseCfg
 from sim.terrains.quantities import Quantity, Sweep
@@ -332,7 +332,7 @@ class ActionDelay(Latency):
 def _disturb_lag(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
     lag = int(wp.round(row[first] / (float(step.every) * step.dt)))
     if lag > 0:
-        age, size = step.memory.age[env, column], step.memory.former.shape[1]
+        age, size = age_of(step, env), step.memory.former.shape[1]
         step.memory.former[env, age % size, column] = step.observation[env, column]
         step.observation[env, column] = step.memory.former[env, wp.max(age - lag, 0) % size, column]
 
@@ -360,7 +360,7 @@ class ObservationLag(Latency):
 def _disturb_noise(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
     if row[first] > 0.0:
         # Drawn by the episode's own stream: neither robot nor slot changes an episode.
-        number = step.memory.age[env, column] * step.observation.shape[1] + column
+        number = age_of(step, env) * step.observation.shape[1] + column
         state = wp.rand_init(int(step.episodes.rng[env]), number)
         step.observation[env, column] += row[first] * step.memory.noise[column] * wp.randf(state, -1.0, 1.0)
 

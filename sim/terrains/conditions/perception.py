@@ -1,9 +1,9 @@
 """Errors of what the controller sees: of the height map around the robot, and of its velocity.
 
-The height scan reads a map of the ground, whose errors act together: :func:`_disturb_scan` finds what the scan shows
-under all of them, and adds its difference from the true scan to the observation, which keeps its noise. The first of
-the conditions has it, and reads the numbers of those that are registered behind it. What is drawn comes from the
-episode's own stream, in MuJoCo C too.
+The height scan reads a map of the ground, whose errors act together: where there are any, the scan is left out of the
+observation, and :func:`_disturb_scan` adds what it shows under all of them. The first of the conditions has it, and
+reads the numbers of those that are registered behind it. What is drawn comes from the episode's own stream, in MuJoCo C
+too.
 """
 
 from typing import Any, ClassVar
@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from kernels.conditions import DisturbedStep
+from kernels.conditions import DisturbedStep, VariedRobots, age_of
 from kernels.heightfield import height_at
-from kernels.observation import LIN_VEL_SCALE, NUM_BASE_COLUMNS, SCAN_OFFSET, SCAN_SCALE, scan_column
+from kernels.observation import LIN_VEL_SCALE, NUM_BASE_COLUMNS, SCAN_OFFSET, SCAN_SCALE
 from kernels.state import base_heading
 from sim.terrains.conditions.kinds import CONDITIONS, GROUPS, Array, Condition, Gene, condition_column, round_steps
 from sim.terrains.quantities import Sweep
@@ -22,6 +22,7 @@ MAX_MAP_DELAY_S = 0.2
 """Longest delay of a height map, and longest time between two of them [s]."""
 HOLE_M = wp.constant(0.2)
 """Side of the square cells of the ground of which some are missing in the map [m]."""
+_MAP_NUMBERS, _SPACING = wp.constant(10), wp.constant(8)
 # Numbers of what is drawn: eight a second, six of the map's drift and two of the velocity's, and behind all one a cell.
 _A_SECOND, _OF_VELOCITY, _OF_CELLS, _CELLS = wp.constant(8), wp.constant(6), wp.constant(1 << 20), wp.constant(1024)
 
@@ -48,24 +49,29 @@ def _drift(step: DisturbedStep, env: int, age: int, notes: bool) -> wp.spatial_v
 
 
 @wp.func
+def _begin_map(robots: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int):
+    robots.is_misled[env] = 0
+    for k in range(_MAP_NUMBERS):
+        if row[first + k] != wp.where(k == _SPACING, 1.0, 0.0):
+            robots.is_misled[env] = 1
+
+
+@wp.func
 def _disturb_scan(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
     k = column - NUM_BASE_COLUMNS - 3 * step.sensors.default_joint_pos.shape[0]
-    if k < 0 or k >= step.sensors.scan_x.shape[0]:
+    if step.memory.is_misled[env] == 0 or k < 0 or k >= step.sensors.scan_x.shape[0]:
         return
     ahead, left, turn = row[first], row[first + 1], row[first + 2]
     drift, tilt = row[first + 3], row[first + 4]
     control_dt = float(step.every) * step.dt
     delay = int(wp.round(row[first + 5] / control_dt))
     period = wp.max(1, int(wp.round(row[first + 6] / control_dt)))
-    share, spacing, grain = row[first + 7], row[first + 8], row[first + 9]
-    is_there = ahead == 0.0 and left == 0.0 and turn == 0.0 and drift == 0.0 and tilt == 0.0
-    if is_there and delay == 0 and period == 1 and share == 0.0 and spacing == 1.0 and grain == 0.0:
-        return
+    share, spacing, grain = row[first + 7], row[first + _SPACING], row[first + 9]
     t = step.terrain_of_env[env]
     heading = base_heading(step.joint_q, env)
     x, y, z = step.joint_q[env, 0], step.joint_q[env, 1], step.joint_q[env, 2]
     seen = wp.spatial_vector(x, y, z, wp.atan2(heading[1], heading[0]), 0.0, 0.0)
-    age, num_poses = step.memory.age[env, column], step.memory.map_pose.shape[1]
+    age, num_poses = age_of(step, env), step.memory.map_pose.shape[1]
     if drift != 0.0 or tilt != 0.0:
         sizes = wp.spatial_vector(drift, drift, drift, tilt, tilt, tilt)
         seen -= wp.cw_mul(sizes, _drift(step, env, age, k == 0))
@@ -90,8 +96,7 @@ def _disturb_scan(step: DisturbedStep, row: wp.array[float], first: int, env: in
         elif is_missing:
             above = step.memory.held[env, k]
         step.memory.held[env, k] = above
-    shown = wp.clamp(above - SCAN_OFFSET, -1.0, 1.0) * SCAN_SCALE
-    step.observation[env, column] += shown - scan_column(step.joint_q, step.terrain, t, step.sensors, env, k)
+    step.observation[env, column] += wp.clamp(above - SCAN_OFFSET, -1.0, 1.0) * SCAN_SCALE
 
 
 class Scans:
@@ -177,6 +182,7 @@ class MapShift(Misperception):
         Gene(name="shift_turn", low=-0.2, middle=0.0, high=0.2, unit="rad", mirrored=True, limits=(-4.0, 4.0)),
     )
     dose = Sweep("shift_x", (0.0, 0.04, 0.08, 0.12, 0.16, 0.2), title="height map shifted ahead")
+    begin = _begin_map
     disturb = _disturb_scan
 
     def text(self, values: Array) -> str:
@@ -265,7 +271,7 @@ def _disturb_velocity(step: DisturbedStep, row: wp.array[float], first: int, env
     shown = row[first] * step.observation[env, column]
     if column < 2:
         second = wp.max(1, int(wp.round(1.0 / (float(step.every) * step.dt))))
-        age = step.memory.age[env, column]
+        age = age_of(step, env)
         number = _A_SECOND * (age // second) + _OF_VELOCITY + column
         before, after = _draw(step, env, number), _draw(step, env, number + _A_SECOND)
         between = float(age % second) / float(second)
