@@ -131,20 +131,21 @@ def bare_rates(rollout: Rollout, terrains: Terrains, rounds: int) -> dict[str, f
 
     Returns:
         ``walking``, in the motion of the crossings; ``standing``, holding the default pose at their start; and in the
-        motion of the crossings ``ground``, on ground with maps of friction and softness that change nothing, and on
-        such ground ``conditions``, under noise and lag of observations, ``all_conditions``, under errors of what robots
-        see, too, and ``route``, with the commands of a route in place of these. Other conditions change nothing.
+        motion of the crossings ``ground``, on ground with maps of friction and softness that change nothing. On such
+        ground robots observe, too, in ``observed``, in ``conditions``, under noise and lag, in ``all_conditions``,
+        under errors of what they see, too, and in ``route``, with the commands of a route in place of these. Other
+        conditions change nothing.
     """
     sim, robot = rollout.sim, rollout.robot
     segments = record_segments(rollout, terrains)
     bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_ground=True)
     bank.set_heights(sim.bank.heights.numpy())
-    motion = Motion(sim, segments)
-    with_maps = Motion(Simulation(robot, bank, sim.terrain_of_env.numpy()), segments)
+    motion, where = Motion(sim, segments), sim.terrain_of_env.numpy()
     seen = [name for name, condition in CONDITIONS.items() if condition.observed]
     motions = {
         "walking": motion,
-        "ground": with_maps,
+        "ground": Motion(Simulation(robot, bank, where), segments),
+        "observed": observed_motion(Simulation(robot, bank, where), segments),
         "conditions": motion_under_conditions(sim, segments),
         "all_conditions": motion_under_conditions(sim, segments, seen),
         "route": motion_under_conditions(sim, segments, GROUPS["command"], Kind.ROUTE),
@@ -158,34 +159,39 @@ def motion_under_conditions(
     sim: Simulation, segments: list[Segment], names: Sequence[str] = (), asks: Kind = Kind.CROSS
 ) -> Motion:
     """The same motion of robots under noise and lag and some other conditions of what nobody reads or obeys."""
-    robot = sim.robot
     bank = TerrainBank(sim.bank.num_terrains, device=sim.device, with_conditions=True)
     bank.set_heights(sim.bank.heights.numpy())
     rows = bank.conditions.numpy()
     rows[:, condition_column("noise")] = 1.0
-    rows[:, condition_column("lag")] = robot.control_dt
+    rows[:, condition_column("lag")] = sim.robot.control_dt
     for gene in condition_genes(names):
         rows[:, condition_column(gene.name)] = gene.to_value(0.5)
     rows[:, -1] = asks
     bank.conditions.assign(rows)
+    return observed_motion(Simulation(sim.robot, bank, sim.terrain_of_env.numpy()), segments, asks)
+
+
+def observed_motion(sim: Simulation, segments: list[Segment], asks: Kind = Kind.CROSS) -> Motion:
+    """The motion of robots that observe in every control step, and begin and follow what conditions ask for."""
+    robot, disturbed = sim.robot, sim.disturbed
     with wp.ScopedDevice(sim.device):
-        varied, episodes = Simulation(robot, bank, sim.terrain_of_env.numpy()), make_episodes(sim.num_envs)
-        varied.begin_conditions(wp.ones(sim.num_envs, dtype=int))
+        episodes, everybody = make_episodes(sim.num_envs), wp.ones(sim.num_envs, dtype=int)
         for values, value in ((episodes.outcome, Outcome.RUNNING), (episodes.kind, asks), (episodes.steps, 1)):
             values.fill_(int(value))
-        trail, command = make_trail(sim.num_envs, robot, sim.device), wp.zeros((sim.num_envs, 3), dtype=float)
-        nobody = wp.zeros(sim.num_envs, dtype=int)
+        command, action = (wp.zeros((sim.num_envs, count), dtype=float) for count in (3, robot.num_joints))
         observation = wp.zeros((sim.num_envs, robot.observation_size), dtype=float)
-
-    task, disturbed = make_task(CrossingCfg(), robot), varied.disturbed
-    assert disturbed is not None
+        nobody, counter = wp.zeros(sim.num_envs, dtype=int), wp.zeros(1, dtype=int)
+        sim.begin_conditions(everybody)
+    trail, task = make_trail(sim.num_envs, robot, sim.device), make_task(CrossingCfg(), robot)
+    step = sim.make_step(command, action)
 
     def beside() -> None:
-        varied.begin_conditions(nobody)
-        follow_routes(varied.joint_q, disturbed.row, task, robot.control_dt, episodes, trail, command)
-        varied.disturb(episodes, robot.physics_dt, observation)
+        sim.begin_conditions(nobody)
+        if disturbed is not None:
+            follow_routes(sim.joint_q, disturbed.row, task, robot.control_dt, episodes, trail, command)
+        sim.observe(step, episodes, robot.physics_dt, None, counter, observation)
 
-    return Motion(varied, segments, beside)
+    return Motion(sim, segments, beside)
 
 
 def standing_rate(rollout: Rollout, motion: Motion, terrains: Terrains) -> float:

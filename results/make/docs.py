@@ -168,15 +168,12 @@ def witnesses() -> str:
 def witness_curve() -> str:
     """Shares of some terrains that are crossed where a search for ways spends so many episodes on each."""
     rows: dict[str, dict[str, Any]] = {}
+    columns: dict[str, Column] = {}
     for label, numbers in read_robots("results/{}/witness.json").items():
         for point in numbers["curve"]:
-            limited = "sought anywhere" if point["limit_m"] is None else "sought on the line"
-            rows.setdefault(f"{label}, {point['episodes']} episodes", {})[limited] = point
-    words = {"line": "on the line", "beside": "at most beside it", "around": "at all"}
-    columns = {
-        f"{limited}: {word}": shown(limited, name, form=".2f")
-        for limited, (name, word) in product(("sought on the line", "sought anywhere"), words.items())
-    }
+            sought, goal = ("anywhere", "around") if point["limit_m"] is None else ("on the line", "line")
+            rows.setdefault(f"{point['episodes']} episodes", {})[name := f"{label}, {sought}"] = point[goal]
+            columns[name] = shown(name, form=".2f")
     return table(rows, columns)
 
 

@@ -111,7 +111,7 @@ def time_iteration(script: Script) -> dict[str, Any]:
         "bare_physics_ratio": rate / bare["walking"],
         "bare_physics_ratio_standing": rate / bare["standing"],
         "ground_step_ratio": bare["walking"] / bare["ground"],
-        **{f"{name}_step_ratio": 1.0 + rate * (1.0 / bare[name] - 1.0 / bare["ground"]) for name in UNDER},
+        **{f"{name}_step_ratio": 1.0 + rate * (1.0 / bare[name] - 1.0 / bare["observed"]) for name in UNDER},
     }
 
 
