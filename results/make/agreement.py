@@ -109,16 +109,15 @@ def measure_set(script: Script, name: str) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Crosses the sets in all ways and writes how far they agree; parts are sets alone."""
+    """Crosses the sets in all ways and writes how far they agree; parts are sets, beside those measured before."""
     script = parse(__doc__, argv, "agreement.json", parts=tuple(IN_MUJOCO_C))
     sets: dict[str, Any] = {}
-    for name in script.parts or IN_MUJOCO_C:
+    for name in IN_MUJOCO_C:
         file = script.runs / "agreement" / f"{name}.json"
-        sets[name] = measure_once(script, file, partial(measure_set, script, name))
-    if script.parts:
-        return {}
+        if name in (script.parts or IN_MUJOCO_C) or script.read_so_far(file):
+            sets[name] = measure_once(script, file, partial(measure_set, script, name))
     keys = {"search": "failing", "again": "failing_again", "resolved": "failing_resolved"}
-    failing = {keys[way]: count for way, count in sets["elites"]["failing"].items()}
+    failing = {keys[way]: count for way, count in sets.get("elites", {}).get("failing", {}).items()}
     return script.write({**sets, **failing})
 
 

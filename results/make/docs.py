@@ -135,7 +135,7 @@ def archives(kind: str = "") -> str:
         "*distinct* faults": "faults_distinct",
     }
     if kind == "short":
-        several = ("families", "failing_families", "elites_same_cell", "faults_fdr", "strong", "robust")
+        several = ("families", "failing_families", "elites_same_cell", "confirmed", "faults_fdr", "strong", "robust")
         columns = {name: column for name, column in columns.items() if column not in several}
     return table({name: numbers for name, numbers in rows.items() if numbers}, columns, upright=True)
 

@@ -1,9 +1,9 @@
 """The pictures of README and docs: ``make pictures``, or ``python -m results.make.pictures`` with some of their kinds.
 
 ``film`` makes docs/pictures/fault.gif from terrains that are kept beside it, so that new archives do not change it; the
-robots' controllers of the day cross them. ``stills`` shows one that a payload breaks, and the worst course where its
-search is here (results.make.spaces). ``pages`` takes the pictures of the viewer and of the report. ``curves`` draws
-what the published files say of searches.
+robots' controllers of the day cross them. ``conditions`` films minimal examples of the published searches under
+conditions, and ``stills`` shows the worst course where its search is here (results.make.spaces).
+``pages`` takes the pictures of the viewer and of the report. ``curves`` draws what the published files say of searches.
 """
 
 import subprocess
@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from kernels.episode import Outcome
 from qd.faults.families import KIN_M
 from qd.faults.searches import controllers_in
 from qd.show.crossed import find_typical_episode, make_title
@@ -27,13 +28,19 @@ from results.make.common import runs_of_today
 from results.make.docs import PAPER, ROBOTS, least_minimum, read, read_robots
 from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
+from sim.rates import typical_outcome
 from sim.robots.find import get_robot
+from sim.terrains.conditions.kinds import CONDITIONS
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 STILL_SIZE = (640, 360)
 """Width and height [pixels]."""
 CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "hole.npz", "a hole", "C-G"))
 """Robot, terrain, what it is in words, and the controller of the panel that is shown beside."""
+FILMED = {"payload": "cassie", "estimate": "cassie", "map_drift": "anymal", "push_2": "anymal"}
+"""Conditions of which a robot's smallest example is filmed."""
+FILM_SIZE, FILM_BYTES = (400, 225), 300_000
+"""Width and height of a small film [pixels], and its largest file."""
 
 
 def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]:
@@ -57,11 +64,24 @@ def take_still(source: ReplaySource, name: str) -> None:
     Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
 
 
-def payload_source() -> ReplaySource:
-    """The smallest minimal terrain of the published search under conditions that needs a payload."""
-    least = least_minimum("anymal", "payload", "conditions")
-    assert least is not None
-    return source_from_run(open_run("anymal", Path("results/anymal/conditions")), minimal=str(least["elite"]))
+def film_failure(source: ReplaySource, name: str, words: str) -> None:
+    """A small film of the commonest failure on a terrain; none where robots do not fail today."""
+    (recording,) = source.record("cpu")
+    stopped = [outcome for outcome in recording.outcome[0] if outcome not in (Outcome.GOAL, Outcome.INVALID)]
+    if not stopped:
+        return
+    episode = find_typical_episode(recording, source.scales, int(typical_outcome(np.array(stopped))))
+    shot = Shot(recording=recording, episode=episode, title=make_title(replace(recording, labels=(words,))))
+    pictures = render_pictures(shot, source.robot, shot.times(GIF_FPS, before_s=1.5, after_s=0.5), FILM_SIZE)
+    save(FOLDER / f"{name}.gif", as_gif([*pictures], FILM_BYTES), "Film")
+
+
+def film_conditions() -> None:
+    """Films of the smallest examples of the published searches under conditions."""
+    for kind, robot in FILMED.items():
+        if (least := least_minimum(robot, kind, "conditions")) is not None:
+            source = source_from_run(open_run(robot, Path(f"results/{robot}/conditions")), minimal=str(least["elite"]))
+            film_failure(source, kind, CONDITIONS[kind].cause)
 
 
 def course_source() -> ReplaySource | None:
@@ -134,14 +154,14 @@ def draw_left() -> Figure:
 
 def main() -> None:
     """Makes the pictures that the command line names, all without any."""
-    wanted = sys.argv[1:] or ["film", "stills", "pages", "curves"]
+    wanted = sys.argv[1:] or ["film", "conditions", "stills", "pages", "curves"]
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
         save(FOLDER / "fault.gif", as_gif(pictures), "Film")
-    if "stills" in wanted:
-        for name, source in {"payload": payload_source(), "course": course_source()}.items():
-            if source is not None:
-                take_still(source, name)
+    if "conditions" in wanted:
+        film_conditions()
+    if "stills" in wanted and (course := course_source()) is not None:
+        take_still(course, "course")
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
         save_figure(FOLDER / "growth.png", draw_growth())

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from kernels.episode import Outcome
 from qd.check import ensure_ready, ensure_stray
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
@@ -24,14 +23,12 @@ from qd.faults.minimise import minimise
 from qd.search.directory import RunDirectory
 from qd.search.loop import search
 from qd.search.settings import preset
-from qd.show.crossed import find_typical_episode
 from qd.show.elites import open_run
-from qd.show.film import GIF_FPS, Shot, as_gif, render_pictures
-from qd.show.replay import save, source_from_run
+from qd.show.replay import source_from_run
 from qd.workers.compute import Compute
 from qd.workers.crosser import Crosser
 from results.make.common import COUNTS, read_alike, runs_of_today
-from results.make.pictures import FOLDER as PICTURES
+from results.make.pictures import film_failure
 from results.make.publishers import LEAGUE, PUBLISHERS, read_mjcf, walk
 from sim.controllers.imports import import_controller
 from sim.device import resolve_device
@@ -39,7 +36,6 @@ from sim.files.atomic import prepare_output, read_json, to_json, write_atomicall
 from sim.files.command import command_line
 from sim.files.provenance import provenance
 from sim.files.settings import read_toml
-from sim.rates import typical_outcome
 from sim.robots.find import fitting_space, get_robot, read_stray
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import MAX_HEIGHT
@@ -61,8 +57,6 @@ OBSTACLES = (f"step_up={_RISES}", f"stairs_up={_RISES}", "payload", "delay")
 """Of which the size is measured that half of the robots cross."""
 RATES = {"terrains": 100, "episodes": 10}
 """Of a set, and of a terrain."""
-FILM_SIZE, FILM_BYTES = (400, 225), 300_000
-"""Width and height [pixels], and the largest file."""
 
 
 def fill_in(file: Path, text: str) -> None:
@@ -209,17 +203,7 @@ def draw_film(name: str, runs: Path) -> None:
     if opened.minima is None:
         return
     source = source_from_run(opened, minimal=str(opened.minima.numbers["elites"][0]["elite"]))
-    (recording,) = source.record("cpu")
-    outcome = recording.outcome[0]
-    stopped = outcome[(outcome != Outcome.GOAL) & (outcome != Outcome.INVALID)]
-    if not len(stopped):
-        return
-    episode = find_typical_episode(recording, source.scales, int(typical_outcome(stopped)))
-    valid = (outcome != Outcome.INVALID).sum()
-    title = f"{name}, {recording.labels[0]}: {len(stopped)} of {valid} do not arrive"
-    shot = Shot(recording=recording, episode=episode, title=title)
-    pictures = render_pictures(shot, source.robot, shot.times(GIF_FPS, before_s=1.5, after_s=0.5), FILM_SIZE)
-    save(PICTURES / f"{name}.gif", as_gif([*pictures], FILM_BYTES), "Film")
+    film_failure(source, name, f"{name}, a minimal terrain")
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
