@@ -37,7 +37,7 @@ STILL_SIZE = (640, 360)
 """Width and height [pixels]."""
 CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "hole.npz", "a hole", "C-G"))
 """Robot, terrain, what it is in words, and the controller of the panel that is shown beside."""
-FILMED = {"payload": "cassie", "estimate": "cassie", "map_drift": "anymal", "push_2": "anymal"}
+FILMED = {"estimate": "anymal", "grip": "cassie", "map_drift": "anymal", "push_2": "anymal"}
 """Conditions of which a robot's smallest example is filmed."""
 FILM_SIZE, FILM_BYTES = (400, 225), 300_000
 """Width and height of a small film [pixels], and its largest file."""
