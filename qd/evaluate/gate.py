@@ -58,7 +58,7 @@ class CheckCfg:
     name: Name = ""
     """Of the check in reports; that of its pack or set if left out."""
     pack: Name = ""
-    """A pack: its folder beside the gate.toml, or the published anymal or cassie."""
+    """A pack: its folder beside the gate.toml, or a published one: anymal, cassie or anymal@1."""
     set: str = ""
     """Or terrains that are drawn: hand_crafted or hard_random."""
     space: str | None = None

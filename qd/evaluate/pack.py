@@ -1,10 +1,11 @@
 """Packs: terrains on which any controller can be tested, as two files of a folder.
 
 ``pack.npz`` has the terrains, ``pack.json`` what is known of each, and the rates of the controllers that the pack was
-made with. A pack is made of a judged search: its terrains are spread over the causes on which the controller fails.
-Every terrain is a fault or a *near-fault*: under :data:`NEAR_GOAL_RATE` of the robots reach the goal in 40 fresh
-episodes, and it is known to be passable, since another controller is certified on it or the searched one crosses it in
-at least half of its episodes. A terrain that nobody is known to cross is in no pack.
+made with. A pack is made of judged searches of one controller: its terrains are spread over the causes on which that
+fails. A pack does not change: one that is made in its place has the next ``version``. Every terrain is a fault or a
+*near-fault*: under :data:`NEAR_GOAL_RATE` of the robots reach the goal in 40 fresh episodes, and it is known to be
+passable, since another controller or a witness is certified on it, or the searched one crosses it in at least half of
+its episodes. A terrain that nobody is known to cross is in no pack.
 """
 
 import hashlib
@@ -23,7 +24,7 @@ from qd.evaluate.labels import MEASURES, RATES
 from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
 from qd.evaluate.sets import TerrainSet, draw_seeds, hash_elites, read_trained_on, set_rng
 from qd.evaluate.tables import rate_cells, show_table
-from qd.faults.families import VERDICTS, find_families, find_verdicts, rank
+from qd.faults.families import VERDICTS, find_families, find_verdicts, kin_distances, rank
 from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers, read_minimal
 from qd.faults.searches import Search, find_certifiers
 from qd.search.archive import Archive
@@ -77,13 +78,15 @@ class Pack:
 
 
 def find_pack(name: str) -> Path:
-    """The folder of a pack by its path, or the published one by the name of a shipped robot."""
-    folder = Path(name)
-    if name in ROBOTS and not (folder / PACK_FILE).is_file():
-        folder = ROBOTS[name].pack
+    """The folder of a pack by its path, or a published one: the newest of a shipped robot, or ``anymal@1``."""
+    folder, (robot, _, version) = Path(name), name.partition("@")
+    published = sorted(ROBOTS[robot].packs.glob("*"), key=lambda pack: int(pack.name)) if robot in ROBOTS else []
+    if published and not (folder / PACK_FILE).is_file():
+        folder = next((pack for pack in published if pack.name == (version or published[-1].name)), folder)
     if not (folder / PACK_FILE).is_file():
         remedy = f"give its folder, or one of {', '.join(ROBOTS)}; `faultline export --pack` makes one"
-        raise FileNotFoundError(f"no pack at {folder}: {remedy}")
+        known = f", of which there are {', '.join(f'{robot}@{pack.name}' for pack in published)}" * bool(published)
+        raise FileNotFoundError(f"no pack at {folder}{known}: {remedy}")
     return folder
 
 
@@ -151,6 +154,8 @@ def evaluate_pack(
     size = len(pack.terrains)
     count, episodes = fill_sizes(compute, terrains, episodes, full=(size, EPISODES), small=(min(24, size), 4))
     check_policy(policy, robot, compute.device)
+    if trained := len(read_trained_on(policy).intersection(hash_elites(pack.genes))):
+        say((f"It was trained on {trained} of the pack's {size} terrains", "bold"), ": its rates say little.")
     terrain_set = pack_set(pack.heights, min(count, size), seed)
     entries = pack.terrains[: len(terrain_set)]
     controller = crosser_name(robot, policy)
@@ -159,12 +164,14 @@ def evaluate_pack(
         sets = {"pack": terrain_set}
         results = cross_sets({controller: policy}, sets, robot, compute, episodes, cache=crossings_folder(robot))
         tested = add_rates(entries, {"this": results["pack"][controller]})
-        keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched")
+        keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched", "version", "licence")
+        about = {key: pack.content.get(key) for key in keys}  # the first packs have no version and licence
         return {
             **compute.origin(seed),
             **controller_identity(robot, policy),
             "episodes": episodes,
-            "pack": {key: pack.content[key] for key in keys} | {"folder": pack.folder.name, "terrains": size},
+            "trained_on": trained,
+            "pack": about | {"folder": pack.folder.name, "terrains": size},
             "rates": summarise_rates(tested, "this", seed),
             "beside": {name: summarise_rates(entries, name, seed) for name in pack.content["rates"]},
             "by": {group: count_failing(tested, "this", group) for group in _GROUPS},
@@ -254,41 +261,58 @@ def show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
 
 
 def make_pack(
-    search: Search,
+    searches: Sequence[Search],
     controllers: Mapping[str, str],
     *,
     compute: Compute,
+    apart_from: Sequence[Archive] = (),
     size: int = 100,
     episodes: int = EPISODES,
     seed: int = 0,
+    licence: str = "",
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Chooses terrains of a judged search, lets controllers cross them, and writes the pack; returns its JSON values.
+    """Chooses terrains of judged searches, lets controllers cross them, and writes the pack; returns its JSON values.
 
-    Without ``controllers`` (policies by name) these are the shipped one and the run's certifiers. The searched one is
-    always among them. There are ``size`` terrains, fewer if the run has fewer, and ``episodes`` on each, which ``seed``
-    draws. Without ``out`` the folder lies under runs/.
+    Without ``controllers`` (policies by name) these are the shipped one and the runs' certifiers. The searched one is
+    always among them. There are ``size`` terrains, fewer if the runs have fewer, and ``episodes`` on each, which
+    ``seed`` draws; none of them is kin of an elite of ``apart_from``. Without ``out`` the folder lies under runs/.
     """
-    archive = _read_judged(search)
-    robot = search.robot
-    controllers = {**(controllers or {"base": str(robot.policy_file), **find_certifiers(search)})}
+    archives = [_read_judged(search) for search in searches]
+    search, robot = searches[0], searches[0].robot
+    for other in searches[1:]:
+        if not (is_same_controller(other.policy, search.policy) and other.space.name == search.space.name):
+            rule = f"runs of one pack must search one controller in one space, as {search.run} does"
+            raise ValueError(f"{rule}, got {other.run} with {other.policy} in {other.space.name}: leave it out")
+    found = {name: file for search in reversed(searches) for name, file in find_certifiers(search).items()}
+    controllers = {**(controllers or {"base": str(robot.policy_file), **found})}
     if not any(is_same_controller(search.policy, policy) for policy in controllers.values()):
         controllers = {"searched": search.policy, **controllers}
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
-    candidates, not_passable = find_candidates(archive, search)
-    trained_on = set[str]().union(*(read_trained_on(file) for name, file in controllers.items() if name != SPECIALIST))
-    hashes = hash_elites(archive.genes)
-    untrained = [candidate for candidate in candidates if hashes[candidate[0]["elite"]] not in trained_on]
-    chosen = [untrained[index] for index in choose_terrains([entry for entry, _ in untrained], size)]
+    candidates, not_passable = list[tuple[Entry, NDArray[np.float32]]](), 0
+    marks = {name: read_trained_on(file) for name, file in controllers.items()}
+    trained_on = set[str]().union(*(of_one for name, of_one in marks.items() if name != SPECIALIST))
+    for number, (one, archive) in enumerate(zip(searches, archives, strict=True)):
+        of_run, more = find_candidates(archive, one)
+        hashes, not_passable = hash_elites(archive.genes), not_passable + more
+        for entry, genes in of_run:
+            if hashes[entry["elite"]] not in trained_on:
+                of_several = {"name": f"run-{number}-{entry['name']}", "run": number} if len(searches) > 1 else {}
+                candidates.append((entry | of_several, genes))
+    candidates = _drop_kin(candidates, apart_from, search)
+    chosen = [candidates[index] for index in choose_terrains([entry for entry, _ in candidates], size)]
     if not chosen:
         rule = "must have faults or near-faults that no controller but a specialist was trained on"
         raise ValueError(f"{search.run} {rule}, got none and {not_passable} that nobody crosses")
-    print(f"{len(chosen)} of {len(untrained)} faults and near-faults; {not_passable} more that nobody crosses.")
+    print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
     chosen_genes = np.array([genes for _, genes in chosen], np.float32)
+    chosen_hashes = hash_elites(chosen_genes)
     heights = round_heights(make_heights(chosen_genes, search.space))
     out = out or RUNS / f"{robot.name}-pack"
     prepare_output(out / TERRAINS_FILE)
+    version = 1 + (read_pack(out).content.get("version") or 1 if (out / PACK_FILE).exists() else 0)
+    described = describe_controllers(controllers, robot)
 
     def make_report() -> dict[str, Any]:
         terrains = {"pack": pack_set(heights, len(heights), seed)}
@@ -297,15 +321,23 @@ def make_pack(
         return {
             **compute.origin(seed),
             **controller_identity(robot, search.policy),
+            "version": version,
+            "licence": licence or None,
             "space": search.cfg.space,
             "space_sha256": search.cfg.space_sha256,
             "episodes": episodes,
             "searched": next(name for name, policy in controllers.items() if is_same_controller(policy, search.policy)),
-            "iterations": archive.iterations,
-            "certifiers": list(archive.certifiers),
-            "candidates": len(untrained),
+            "runs": [
+                {"run": one.run.name, "seed": one.cfg.seed, "iterations": archive.iterations, "elites": len(archive)}
+                for one, archive in zip(searches, archives, strict=True)
+            ],
+            "certifiers": sorted({name for archive in archives for name in archive.certifiers}),
+            "candidates": len(candidates),
             "not_known_to_be_passable": not_passable,
-            "controllers": describe_controllers(controllers, robot),
+            "controllers": {
+                name: about | {"trained_on": len(marks[name].intersection(chosen_hashes))}
+                for name, about in described.items()
+            },
             "rates": {name: summarise_rates(crossed, name, seed) for name in controllers},
             "terrains_sha256": write_terrains(out, heights, chosen_genes),
             "terrains": crossed,
@@ -317,6 +349,27 @@ def make_pack(
         show_pack_rates(title, report["rates"])
 
     return publish(out / PACK_FILE, make_report, show)
+
+
+def _drop_kin(
+    candidates: list[tuple[Entry, NDArray[np.float32]]], apart_from: Sequence[Archive], search: Search
+) -> list[tuple[Entry, NDArray[np.float32]]]:
+    """Candidates that are no kin of an elite of some archives, with families over all of the runs."""
+    for archive in apart_from:
+        if archive.space != search.space.name:
+            rule = f"archives to be apart from must be of the space {search.space.name}"
+            raise ValueError(f"{rule}, got {archive.space}: leave it out")
+    if not candidates:
+        return []
+    genes = np.array([row for _, row in candidates], np.float32)
+    others = np.concatenate([genes[:0], *(archive.genes for archive in apart_from)])
+    distances = kin_distances(np.concatenate([genes, others]), search.space)[: len(genes), len(genes) :]
+    rows = np.flatnonzero((distances >= 1.0).all(axis=1))
+    if len(rows) < len(genes):
+        print(f"{len(genes) - len(rows)} of {len(genes)} are kin of what controllers trained on.")
+    families = find_families(genes[rows], search.space).tolist() if len(rows) else []
+    left = [candidates[row] for row in rows]
+    return [(entry | {"family": family}, row) for (entry, row), family in zip(left, families, strict=True)]
 
 
 def _read_judged(search: Search) -> Archive:
@@ -363,11 +416,11 @@ def find_candidates(archive: Archive, search: Search) -> tuple[list[tuple[Entry,
 
     verdicts = find_verdicts(archive)
     for number in near.tolist():
-        if archive.certified_by_controllers[number] or rate[number] >= FAILING_GOAL_RATE:
+        if archive.certified[number] or rate[number] >= FAILING_GOAL_RATE:
             numbers = {"searched": rate_numbers(fresh_counts(archive, number)), **judgement(archive, number)}
             add(number, None, archive.genes[number], VERDICTS[verdicts[number]], **numbers)
         else:
-            not_passable += not archive.certified[number]  # steered, a robot may cross it
+            not_passable += 1
     for minimal in minima.numbers["elites"] if minima else ():
         number = minimal["elite"]
         if not archive.failing[number] or len(minimal["bumps"]) == minimal["of"]:

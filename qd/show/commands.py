@@ -101,7 +101,13 @@ class PackFlags(WorkerFlags):
     """How a pack is made."""
 
     size: PositiveInt = 100
-    """How many terrains. There are fewer if the run has fewer faults and near-faults."""
+    """How many terrains. There are fewer if the runs have fewer faults and near-faults."""
+    runs: tuple[Path, ...] = ()
+    """Further judged runs against the same controller, whose faults the pack takes, too."""
+    apart_from: tuple[Path, ...] = ()
+    """Runs on which controllers were trained: the pack takes no kin of their elites."""
+    licence: str = ""
+    """Licence of the pack, which it names: CC-BY-4.0."""
     controllers: tuple[str, ...] = ()
     """Controllers that cross them, each NAME=FILE, as --policy takes it. If left out, the shipped one as base and
     the run's certifiers. The searched controller is always among them."""
@@ -119,13 +125,14 @@ class ExportCommand(ControllerFlags, EliteFlags):
     verdict, cause and ending, and a README.md that says how MuJoCo, mjlab, Isaac Lab and Gazebo take them. `faultline
     replay --terrain elite-N.npz`, or with the .png, crosses it again.
 
-    With --pack it makes a pack from a judged run: faults and near-faults, spread over the ways in which the searched
-    controller fails and over families of kin, to test any controller on with `faultline evaluate --pack`.
+    With --pack it makes a pack from judged runs: faults and near-faults, spread over the ways in which the searched
+    controller fails and over families of kin, to test any controller on with `faultline evaluate --pack`. One that is
+    made in place of another has the next version.
     """
 
     from_pack: str | None = None
-    """Take the terrains of a pack instead of elites: its folder, or anymal or cassie for the published one. --elite
-    counts its terrains, from 0; their files are called as the pack calls them."""
+    """Take the terrains of a pack instead of elites: its folder, or anymal, cassie or anymal@1 for a published one.
+    --elite counts its terrains, from 0; their files are called as the pack calls them."""
     formats: tuple[str, ...] = ("npz", "png", "npy", "xml", "stl", "glb", "sdf")
     """Which to write; several may stand in one, apart by spaces."""
     overwrite: bool = False
@@ -162,17 +169,20 @@ class ExportCommand(ControllerFlags, EliteFlags):
     def _make_pack(self) -> None:
         from qd.evaluate.pack import make_pack
         from qd.faults.searches import find_search
+        from qd.search.archive import read_archive
         from qd.search.directory import find_run
         from qd.workers.compute import Compute
 
         making = self.making
         robot = get_robot(self.robot or "anymal")
         run = find_run(robot, self.run, published="never")
-        search = find_search(run, robot=self.robot, policy=self.policy, space=self.space)
+        named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space}
+        searches = [find_search(one, **named) for one in (run, *making.runs)]
+        apart_from = [read_archive(one) for one in making.apart_from]
         controllers = parse_controllers(making.controllers, robot) if making.controllers else {}
         compute = Compute.resolve(making.device, making.workers, making.num_envs)
-        sizes: Any = {"size": making.size, "episodes": making.episodes, "seed": making.seed}
-        make_pack(search, controllers, compute=compute, out=self.out, **sizes)
+        sizes: Any = {name: getattr(making, name) for name in ("size", "episodes", "seed", "licence")}
+        make_pack(searches, controllers, compute=compute, apart_from=apart_from, out=self.out, **sizes)
 
 
 @dataclass(frozen=True, kw_only=True)

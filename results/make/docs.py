@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from qd.evaluate.labels import HELD_OUT, SETS
+from qd.evaluate.pack import find_pack
 from sim.files.intervals import format_value
 
 ROOT = Path(__file__).parents[2]
@@ -485,7 +486,7 @@ def list_causes(count: int) -> Callable[[Any], str]:
 
 def packs() -> str:
     """Controllers on the published packs: goal rate, and failed terrains."""
-    files = read_robots("sim/robots/{}/pack/pack.json")
+    files = {label: read(f"{find_pack(robot)}/pack.json") for robot, label in ROBOTS.items()}
 
     def cell(rates: Mapping[str, Any]) -> Callable[[Any], str]:
         def result(name: str) -> str:

@@ -1,25 +1,40 @@
-"""The published pack, sim/robots/<robot>/pack: 100 certified terrains, and how often controllers cross them.
+"""The published packs, sim/robots/<robot>/packs: 100 terrains that can be crossed, and how often controllers do.
 
-They are of the independent search, which no published controller has trained on, nor on kin of it.
+They come from two searches of their own, of preset wide to 384,000 episodes, judged by the panel and by witnesses. No
+published controller has trained on them, nor on kin of them: C-G trained on the published archive.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 from qd.evaluate.pack import make_pack
 from qd.faults.judge import judge
 from qd.faults.searches import find_search
+from qd.search.loop import search
 from results.make.common import parse, published_controllers
+
+VERSION = 2
+SEEDS = (100, 101)
+"""Of the searches, far from those of all others."""
+EPISODES = 384_000
+STAGES = ("fresh", "resolved", "others", "steered")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Chooses the terrains and lets the published controllers cross them."""
-    script = parse(__doc__, argv, "pack/pack.json", published="sim/robots")
-    size, episodes = (2, 2) if script.small else (100, 20)
-    run = script.run_of_archive("archive" if script.small else "independent")
-    if not script.small:
-        judge(run, stages=("resolved", "others"), compute=script.compute)
-    sizes = {"size": size, "episodes": episodes, "seed": script.seed}
-    make_pack(find_search(run), published_controllers(script), compute=script.compute, out=script.out.parent, **sizes)
+    """Searches, judges, chooses the terrains, and lets controllers cross them; parts are searches alone."""
+    names = tuple(f"search {seed}" for seed in SEEDS)
+    script = parse(__doc__, argv, f"packs/{VERSION}/pack.json", published="sim/robots", parts=names)
+    runs = [script.runs / "packs" / str(seed) for seed in SEEDS[: 1 if script.small else None]]
+    for name, seed, run in zip(names, SEEDS, runs, strict=False):
+        if not script.parts or name in script.parts:
+            search(script.search_cfg(episodes=EPISODES, seed=seed), run, script.compute)
+            judge(run, stages=STAGES[:1] if script.small else STAGES, compute=script.compute)
+    if script.parts:
+        return
+    trained = {name: file for name, file in published_controllers(script).items() if name != "hardened"}
+    sizes: dict[str, Any] = {"size": 2, "episodes": 2} if script.small else {"size": 100, "episodes": 20}
+    how = {"compute": script.compute, "apart_from": [script.read_archive()], "licence": "Apache-2.0", **sizes}
+    make_pack([*map(find_search, runs)], trained, seed=script.seed, out=script.out.parent, **how)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
     commit = variable.removesuffix("-dirty") or None
     dirty: bool | None = variable.endswith("-dirty")
     if commit is None:
-        folders = [*(ROOT / name for name in (*ROOMS, "results/make")), ":(exclude)sim/robots/*/pack/*"]
+        folders = [*(ROOT / name for name in (*ROOMS, "results/make")), ":(exclude)sim/robots/*/packs/*"]
         changes = _run(["git", "status", "--porcelain", "--untracked-files=no", "--", *folders])
         commit = _run(["git", "rev-parse", "HEAD"])
         dirty = None if changes is None else changes != ""

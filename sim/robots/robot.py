@@ -189,9 +189,9 @@ class RobotCfg:
         return self.home / self.name / "panel"
 
     @property
-    def pack(self) -> Path:
-        """Folder of its published pack (``faultline evaluate --pack``)."""
-        return self.home / self.name / "pack"
+    def packs(self) -> Path:
+        """Folder of its published packs by version (``faultline evaluate --pack``)."""
+        return self.home / self.name / "packs"
 
     def scan_points(self) -> tuple[np.ndarray, np.ndarray]:
         """Scan points in observation order (x slowest), two arrays of shape (num_scan_points,) [m]."""

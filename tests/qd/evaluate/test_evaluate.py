@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -173,8 +175,9 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     robots, base = Robots(fails), {"base": str(anymal.policy_file)}
 
-    def make(controllers, **changes):
-        return packs.make_pack(find_search(path), controllers, compute=compute_by(robots), out=Path("pack"), **changes)
+    def make(controllers, *others, **changes):
+        searches = [*map(find_search, (path, *others))]
+        return packs.make_pack(searches, controllers, compute=compute_by(robots), out=Path("pack"), **changes)
 
     compute = compute_by(Robots(bump_stops))
     judge(path, stages=("resolved",), compute=compute)
@@ -202,13 +205,28 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
     assert [entry["name"] for entry in few["terrains"]] == [entry["name"] for entry in content["terrains"][:3]]
     assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
+    # A pack in place of another has the next version; runs are joined, and kin of both are one family.
+    other = shutil.copytree(path, tmp_path / "other")
+    joined = make(base | OTHER, other, licence="CC-BY-4.0")
+    assert (content["version"], joined["version"], joined["licence"]) == (1, 4, "CC-BY-4.0")
+    assert len(joined["terrains"]) == 2 * len(content["terrains"]) and joined["runs"][1]["run"] == "other"
+    names, families = (
+        [{entry[key] for entry in pack["terrains"]} for pack in (content, joined)] for key in ("name", "family")
+    )
+    assert names[1] == {f"run-{run}-{name}" for run in (0, 1) for name in names[0]} and families[0] == families[1]
+    with pytest.raises(ValueError, match="none"):  # all are kin of themselves
+        make(base | OTHER, apart_from=[archive])
+    first = content["terrains"][0]["elite"]
+    one = replace(archive, genes=np.repeat(archive.genes[[first]], len(archive), axis=0))
+    left = {entry["name"] for entry in make(base | OTHER, apart_from=[one])["terrains"]}
+    assert f"elite-{first}" not in left < names[0]
 
 
-def test_what_a_steered_robot_crosses_is_no_candidate_and_passable(anymal, tmp_path):
+def test_what_a_steered_robot_crosses_on_the_line_is_a_candidate(anymal, tmp_path):
     search = SimpleNamespace(space=SUPER_GAUSSIAN, run=tmp_path, robot=anymal)
-    for archive, not_passable in ((judged_archive(), 2), (steered_archive(), 1)):  # elites 1 and 3; 1 on the line
-        candidates, count = packs.find_candidates(archive, search)
-        assert [entry["elite"] for entry, _ in candidates] == [0, 2, 4] and count == not_passable
+    for archive, passable in ((judged_archive(), [0, 2, 4]), (steered_archive(), [0, 1, 2, 4])):
+        candidates, not_passable = packs.find_candidates(archive, search)
+        assert [entry["elite"] for entry, _ in candidates] == passable and not_passable == 5 - len(passable)
 
 
 @pytest.fixture
@@ -235,10 +253,12 @@ def test_a_pack_is_read_as_it_was_written(pack):
     np.testing.assert_array_equal(stored.heights, packs.round_heights(pack))
     assert np.abs(stored.heights - pack).max() <= packs.HEIGHT_UNIT_M / 2 + 1e-6
     assert stored.genes[:, 0].tolist() == pytest.approx([0.03, 0.07, 0.09])
-    assert packs.find_pack("anymal") == ROBOTS["anymal"].pack
-    assert len(packs.read_pack(packs.find_pack("cassie")).terrains) == 100
-    with pytest.raises(FileNotFoundError, match="dog"):
-        packs.find_pack("dog")
+    assert packs.find_pack("anymal") == max(ROBOTS["anymal"].packs.glob("*"), key=lambda one: int(one.name))
+    assert packs.find_pack("cassie@1") == ROBOTS["cassie"].packs / "1"
+    assert len(packs.read_pack(packs.find_pack("cassie@1")).terrains) == 100
+    for unknown, known in (("dog", "dog"), ("cassie@0", "cassie@1")):
+        with pytest.raises(FileNotFoundError, match=known):
+            packs.find_pack(unknown)
 
 
 @pytest.mark.parametrize("damage", ["npz", "other", "key"])
