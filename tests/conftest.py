@@ -4,13 +4,20 @@ A test that takes the ``device`` fixture, by itself or through another fixture, 
 CPU, and on a GPU where FAULTLINE_DEVICE names one.
 """
 
+import tests.imports
+
+# isort: split
 import tests.toys  # noqa: F401  before anything reads the registries
 
 # isort: split
+import gc
+import multiprocessing
 import os
 import shutil
 from collections.abc import Iterator
+from multiprocessing import forkserver
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +25,7 @@ import torch
 import warp as wp
 
 from qd.search import loop
-from qd.workers import crosser
+from qd.workers import crosser, process
 from sim.device import resolve_device
 from sim.files.command import publish
 from sim.files.provenance import provenance
@@ -40,6 +47,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "device" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.gpu)
+
+
+def pytest_collection_finish() -> None:
+    """Collects garbage again, but for what tests are made of."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
@@ -68,6 +81,31 @@ def pytest_runtest_call() -> Iterator[None]:
 def one_thread():
     """One core for torch, as the search's workers have it: its threads spin for each other on a busy machine."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def forked_workers():
+    """On the CPU worker processes are forks of one that has loaded Newton, which takes most of their start."""
+    with pytest.MonkeyPatch.context() as patch:
+        if DEVICE == "cpu":
+            patch.setattr(process, "CONTEXT", fork_from("sim.simulation", "sim.rollout", "qd.workers.crosser"))
+        yield
+
+
+@pytest.fixture(scope="module")
+def nursery(forked_workers):
+    """Processes are forks of one that has searched before (tests.kills.nursery)."""
+    fork_from("tests.kills.nursery")
+    yield
+    fork_from("sim.simulation", "sim.rollout", "qd.workers.crosser")
+
+
+def fork_from(*modules: str) -> Any:
+    """A context whose processes are forks of a new server, which loads some modules first."""
+    context = multiprocessing.get_context("forkserver")
+    forkserver._forkserver._stop()
+    context.set_forkserver_preload(["tests.imports", *modules])
+    return context
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -72,6 +72,12 @@ class Pack:
     """Of ``pack.json``."""
 
     @property
+    def name(self) -> str:
+        """What a published one is asked for by, ``anymal@1``, or its folder."""
+        version = self.folder.name
+        return f"{self.content['robot']}@{version}" if self.folder.parent.name == "packs" else version
+
+    @property
     def terrains(self) -> list[Entry]:
         """What the pack says of each terrain."""
         return self.content["terrains"]
@@ -171,7 +177,7 @@ def evaluate_pack(
             **controller_identity(robot, policy),
             "episodes": episodes,
             "trained_on": trained,
-            "pack": about | {"folder": pack.folder.name, "terrains": size},
+            "pack": about | {"folder": pack.name, "terrains": size},
             "rates": summarise_rates(tested, "this", seed),
             "beside": {name: summarise_rates(entries, name, seed) for name in pack.content["rates"]},
             "by": {group: count_failing(tested, "this", group) for group in _GROUPS},

@@ -70,7 +70,7 @@ def export_pack(
 
     about = {name: {"robot": pack_robot.name, "place": row, **pack.terrains[row]} for name, row in rows.items()}
     keys = ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")
-    origin = {"pack": folder.name} | {key: pack.content[key] for key in keys}
+    origin = {"pack": pack.name} | {key: pack.content[key] for key in keys}
     out = out or RUNS / f"{pack_robot.name}-pack-{_FOLDER}"
     terrains = (
         ExportedTerrain(name=name, heights=pack.heights[row], genes=pack.genes[row], timestep=pack_robot.physics_dt)

@@ -14,6 +14,9 @@ from typing import Any
 
 from sim.files.command import UserError, with_traceback
 
+CONTEXT: Any = multiprocessing.get_context("spawn")
+"""How processes begin: a fork of one with threads and CUDA may hang."""
+
 
 class EvaluatorError(UserError):
     """The evaluation cannot go on; what was saved before is whole."""
@@ -23,9 +26,8 @@ class WorkerProcess:
     """A process with a simulation, which ``build``, a module-level function, makes there for ``num_terrains``."""
 
     def __init__(self, num_terrains: int, build: Callable[[Any, int], Any], cfg: Any) -> None:
-        context = multiprocessing.get_context("spawn")  # a fork of a process with threads and CUDA may hang
-        self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, cfg, num_terrains, build), daemon=True)
+        self.connection, theirs = CONTEXT.Pipe()
+        self._process = CONTEXT.Process(target=_serve, args=(theirs, cfg, num_terrains, build), daemon=True)
         # A blocked signal stays blocked in the child: Ctrl-C reaches the whole group, and the parent ends its workers.
         ensure_running()  # else the first start begins the tracker, which unblocks the signal again on Python 3.11
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -21,19 +21,25 @@ STAGES = ("fresh", "resolved", "others", "steered")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Searches, judges, chooses the terrains, and lets controllers cross them; parts are searches alone."""
+    """Searches, judges, chooses the terrains, and lets controllers cross them; parts are searches alone.
+
+    A trial takes terrains of the published archive.
+    """
     names = tuple(f"search {seed}" for seed in SEEDS)
     script = parse(__doc__, argv, f"packs/{VERSION}/pack.json", published="sim/robots", parts=names)
-    runs = [script.runs / "packs" / str(seed) for seed in SEEDS[: 1 if script.small else None]]
-    for name, seed, run in zip(names, SEEDS, runs, strict=False):
-        if not script.parts or name in script.parts:
+    runs = [script.runs / "packs" / str(seed) for seed in SEEDS]
+    for name, seed, run in zip(names, SEEDS, runs, strict=True):
+        if not script.small and name in (script.parts or names):
             search(script.search_cfg(episodes=EPISODES, seed=seed), run, script.compute)
-            judge(run, stages=STAGES[:1] if script.small else STAGES, compute=script.compute)
+            judge(run, stages=STAGES, compute=script.compute)
     if script.parts:
         return
+    if script.small:
+        runs = [script.run_of_archive()]
     trained = {name: file for name, file in published_controllers(script).items() if name != "hardened"}
     sizes: dict[str, Any] = {"size": 2, "episodes": 2} if script.small else {"size": 100, "episodes": 20}
-    how = {"compute": script.compute, "apart_from": [script.read_archive()], "licence": "Apache-2.0", **sizes}
+    apart_from = [] if script.small else [script.read_archive()]
+    how = {"compute": script.compute, "apart_from": apart_from, "licence": "Apache-2.0", **sizes}
     make_pack([*map(find_search, runs)], trained, seed=script.seed, out=script.out.parent, **how)
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["tests.kills.nursery"])
 _PATIENCE_S = 300.0
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import torch
 
-os.environ["NUMBA_DISABLE_JIT"] = "1"  # spares compiling the evolution strategy
 os.environ.setdefault("FAULTLINE_COMMIT", "under test")  # spares asking git
 
 from tests.kills import runs

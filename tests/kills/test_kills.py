@@ -27,6 +27,7 @@ from tests.kills import runs
 from tests.kills.faults import fill, run_child
 from train.ppo.checkpoint import read_checkpoint
 
+pytestmark = pytest.mark.usefixtures("nursery")
 SEED = 5
 MUTATIONS = 100
 EXPECTED = (ValueError, FileNotFoundError)

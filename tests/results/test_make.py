@@ -292,7 +292,7 @@ def test_tables_of_witnesses_tell_certificates_by_controllers_from_others(monkey
         "| Dog | 9 | 3 | 2 | 2 | 1 | 4 | 3 | 5 | 6 | 1.5 |",
         "| Dog, plain crossings in their place | 9 | 0 | - | 0 | 1 | - | - | - | - | - |",
     ]
-    assert docs.witness_curve().splitlines()[2:] == ["| Dog, 20 episodes | 0.38 | 0.50 | 0.75 | 0.25 | 0.50 | 0.75 |"]
+    assert docs.witness_curve().splitlines()[2:] == ["| 20 episodes | 0.38 | 0.75 |"]
     monkeypatch.setattr(docs, "ROBOTS", {"dog": "Dog"})
     held = {"hold": 5, "tried": 6, "strong": {"hold": 2, "tried": 3}}
     monkeypatch.setattr(docs, "ROBOTS", {"dog": "Dog"})

@@ -360,7 +360,7 @@ def test_files_of_an_earlier_export_are_replaced_only_if_that_is_asked_for(run):
 def test_a_pack_is_exported_with_what_it_knows(tmp_path):
     (*_, about, _, _) = export_pack("anymal", "3", formats=("xml",), out=tmp_path)
     content = json.loads(about.read_text())
-    assert content["verdict"] == "fault" and content["start"][:2] == [2, 4] and content["pack"] == "pack"
+    assert content["verdict"] == "fault" and content["start"][:2] == [2, 4] and content["pack"] == "anymal@1"
 
 
 def test_a_controller_is_not_replaced_silently(anymal, tmp_path):
