@@ -91,6 +91,8 @@ class DisturbedStep:
     """Length of the steps that the episodes count [s]."""
     every: int
     """How many of them are a control step."""
+    decimation: int
+    """How many physics steps are."""
     joint_q: wp.array2d[float]
     joint_qd: wp.array2d[float]
     terrain: Terrain
@@ -130,7 +132,7 @@ class ForcedStep:
 @wp.func
 def age_of(step: DisturbedStep, env: int) -> int:
     """Control steps since the episode began."""
-    return step.episodes.steps[env] // step.every
+    return step.memory.steps[env] // step.decimation
 
 
 @wp.func

@@ -315,14 +315,14 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
     """
 
     pack: str | None = None
-    """Pack of faults that the controller is tested on: a folder that `faultline export` made, or anymal or cassie for
-    the published one. --terrains takes the first of it; all on CUDA."""
+    """Pack of faults that the controller is tested on: a folder that `faultline export` made, or a published one:
+    anymal or cassie, or of a version anymal@1. --terrains takes the first of it; all on CUDA."""
     fail_under: Annotated[float, Meta(ge=0, le=1)] | None = None
     """With --pack: exit with status 1 if the lower end of the 95 % interval of the goal rate is below this."""
     gate: Path | None = None
-    """Settings of a gate: tables [[check]] with pack = FOLDER or anymal or cassie, or set = hand_crafted or hard_random
-    with space; name, terrains (100), limit of the mean goal rate, margin (0.05), rounds (40), which are episodes of a
-    terrain at most; and before them error (0.05) and seed (0). docs/testing.md has one."""
+    """Settings of a gate: tables [[check]] with pack = FOLDER or anymal@1 or cassie@1, or set = hand_crafted or
+    hard_random with space; name, terrains (100), limit of the mean goal rate, margin (0.05), rounds (40), which are
+    episodes of a terrain at most; and before them error (0.05) and seed (0). docs/testing.md has one."""
     junit: Path | None = None
     """With --gate: file for the verdicts as JUnit XML."""
     policies: tuple[str, ...] = ()

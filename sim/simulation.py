@@ -326,7 +326,7 @@ class Simulation:
     def disturb(self, episodes: Episodes, dt: float, observation: Any) -> None:
         """Push robots and disturb observations as the conditions of their terrains say (:meth:`observe`)."""
         if self.disturbed is not None:
-            values = {"dt": dt, "every": round(self.robot.control_dt / dt)}
+            values = {"dt": dt, "every": round(self.robot.control_dt / dt), "decimation": self.robot.decimation}
             values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
             values["terrain"] = self.bank.terrain
             make_disturb(condition_effects("disturb"))(make_struct(DisturbedStep, self, **values))

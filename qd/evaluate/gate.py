@@ -13,7 +13,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import crossings_folder
 from qd.evaluate.level import MIN_GOAL_RATE, measure_level_ground
-from qd.evaluate.pack import PACK_FILE, Entry, find_pack, pack_set, read_pack
+from qd.evaluate.pack import PACK_FILE, Entry, count_trained, find_pack, pack_set, read_pack
 from qd.evaluate.sequential import PairedTest, RateTest, rate_interval
 from qd.evaluate.sets import plain_set
 from qd.search.directory import RUNS
@@ -120,8 +120,15 @@ def draw_round(terrains: Terrains, seed: int, check: int, number: int) -> Terrai
     return Terrains(**{**vars(terrains), "seeds": sequence.generate_state(count).astype(np.uint32)})
 
 
-CheckTerrains = tuple[Terrains, list[Entry], str]
-"""Terrains of a check, what a pack says of them (nothing of others), and their SHA-256."""
+class CheckTerrains(NamedTuple):
+    """Terrains of a check."""
+
+    terrains: Terrains
+    sha256: str
+    known: list[Entry]
+    """What a pack says of them; nothing of others."""
+    pack: str | None
+    """The pack by its name and version."""
 
 
 def check_terrains(check: CheckCfg, seed: int, robot: RobotCfg, folder: Path) -> CheckTerrains:
@@ -129,11 +136,13 @@ def check_terrains(check: CheckCfg, seed: int, robot: RobotCfg, folder: Path) ->
     if not check.pack:
         space = space_at(load_space(check.space), None, robot)
         terrains = plain_set(check.set, check.terrains, seed, space).terrains
-        return terrains, [], hashlib.sha256(np.ascontiguousarray(terrains.values).tobytes()).hexdigest()
+        digest = hashlib.sha256(np.ascontiguousarray(terrains.values).tobytes()).hexdigest()
+        return CheckTerrains(terrains, digest, [], None)
     pack = read_pack(find_pack(str(folder / check.pack) if (folder / check.pack).is_dir() else check.pack))
     resolve_robot(pack.content, robot, pack.folder / PACK_FILE, kind="pack")
     terrains = pack_set(pack.heights, check.terrains, seed).terrains
-    return terrains, pack.terrains[: len(terrains)], pack.content["terrains_sha256"]
+    name = f"{pack.name}, version {pack.content['version']}"
+    return CheckTerrains(terrains, pack.content["terrains_sha256"], pack.terrains[: len(terrains)], name)
 
 
 def run_check(
@@ -145,7 +154,7 @@ def run_check(
     Invalid episodes are counted, and left out of rates and pairs.
     """
     began = time.perf_counter()
-    terrains, known, digest = drawn
+    terrains, known = drawn.terrains, drawn.known
     count, name = len(terrains), check.title
     goals = {by: np.zeros((2, count), np.int64) for by in policies}  # reached, and valid episodes
     tests: dict[str, RateTest | PairedTest] = {}
@@ -187,7 +196,9 @@ def run_check(
         "name": name,
         "settings": asdict(check),
         "terrains": count,
-        "terrains_sha256": digest,
+        "terrains_sha256": drawn.sha256,
+        "pack": drawn.pack,
+        "trained_on": count_trained(known, policies["new"]),
         "passes": all(passes for passes, _ in verdicts.values()),
         "tests": {
             kind: {"passes": passes, "stopped": how, "rounds": clear.get(kind, done)}
@@ -306,11 +317,14 @@ def to_markdown(report: Mapping[str, Any]) -> str:
         rates = ", ".join(f"{by} {rate:.3f}" for by, rate in check["goal_rate"].items())
         invalid = f", {check['invalid_episodes']} of them invalid and left out" if check["invalid_episodes"] else ""
         of_all = f"over all {check['episodes']} episodes{invalid}"
-        fails = f"{len(check['failing'])} of {check['terrains']} terrains failed in {check['rounds']} episodes each"
+        of_pack = f" of {check['pack']}" * bool(check["pack"])
+        fails = f"{len(check['failing'])} of {check['terrains']} terrains{of_pack} failed"
+        fails += f" in {check['rounds']} episodes each"
+        fails += f"; it was trained on {check['trained_on']} of them" * bool(check["trained_on"])
         lines += ["", f"**{check['name']}**: goal rate {rates} (new {low:.3f} to {high:.3f}, 95 %) {of_all}; {fails}."]
-    error = (
-        f"A clear test is wrong with a chance of at most {report['error']:.3g}, at the margin from the limit or beyond."
-    )
+    tests, chance = sum(len(check["tests"]) for check in report["checks"]), report["error"]
+    error = f"A clear test is wrong with a chance of at most {chance:.3g}, at the margin from the limit or beyond"
+    error += f"; one of these {tests} with at most {min(1.0, tests * chance):.3g}." if tests > 1 else "."
     return "\n".join([*lines, "", error, ""])
 
 
@@ -321,7 +335,7 @@ def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], fold
     """
     for old in folder.glob("*.npz"):
         old.unlink()
-    for number, (found, (terrains, _, _)) in enumerate(zip(report["checks"], drawn, strict=False), 1):
+    for number, (found, (terrains, *_)) in enumerate(zip(report["checks"], drawn, strict=False), 1):
         if found["passes"] or terrains.space.has_conditions or terrains.space.ground:
             continue
         failing = sorted(found["failing"], key=lambda row: (-row.get("old_goals", 0), row["goals"] / row["episodes"]))

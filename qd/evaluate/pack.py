@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
 from qd.evaluate.labels import MEASURES, RATES
 from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
-from qd.evaluate.sets import TerrainSet, draw_seeds, hash_elites, read_trained_on, set_rng
+from qd.evaluate.sets import TerrainSet, draw_seeds, elites_sha256, hash_elites, read_trained_on, set_rng
 from qd.evaluate.tables import rate_cells, show_table
 from qd.faults.families import VERDICTS, find_families, find_verdicts, kin_distances, rank
 from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers, read_minimal
@@ -74,8 +74,8 @@ class Pack:
     @property
     def name(self) -> str:
         """What a published one is asked for by, ``anymal@1``, or its folder."""
-        version = self.folder.name
-        return f"{self.content['robot']}@{version}" if self.folder.parent.name == "packs" else version
+        published = self.folder.parent == ROBOTS[robot].packs if (robot := self.content["robot"]) in ROBOTS else False
+        return f"{robot}@{self.folder.name}" if published else self.folder.name
 
     @property
     def terrains(self) -> list[Entry]:
@@ -85,14 +85,14 @@ class Pack:
 
 def find_pack(name: str) -> Path:
     """The folder of a pack by its path, or a published one: the newest of a shipped robot, or ``anymal@1``."""
-    folder, (robot, _, version) = Path(name), name.partition("@")
-    published = sorted(ROBOTS[robot].packs.glob("*"), key=lambda pack: int(pack.name)) if robot in ROBOTS else []
-    if published and not (folder / PACK_FILE).is_file():
-        folder = next((pack for pack in published if pack.name == (version or published[-1].name)), folder)
-    if not (folder / PACK_FILE).is_file():
-        remedy = f"give its folder, or one of {', '.join(ROBOTS)}; `faultline export --pack` makes one"
-        known = f", of which there are {', '.join(f'{robot}@{pack.name}' for pack in published)}" * bool(published)
-        raise FileNotFoundError(f"no pack at {folder}{known}: {remedy}")
+    folder, (robot, named, version) = Path(name), name.partition("@")
+    packs = ROBOTS[robot].packs if robot in ROBOTS else folder
+    versions = sorted(int(pack.parent.name) for pack in packs.glob(f"*/{PACK_FILE}") if pack.parent.name.isdecimal())
+    if robot in ROBOTS and versions and not (folder / PACK_FILE).is_file():
+        folder = packs / (version if named else str(versions[-1]))
+    if not (folder / PACK_FILE).is_file() or (named and not version):
+        known = ", ".join(f"{robot}@{number}" for number in versions if robot in ROBOTS) or ", ".join(ROBOTS)
+        raise FileNotFoundError(f"no pack {name}: give its folder, or {known}; `faultline export --pack` makes one")
     return folder
 
 
@@ -106,6 +106,9 @@ def read_pack(folder: Path) -> Pack:
         if hashlib.sha256(file.read_bytes()).hexdigest() != content["terrains_sha256"]:
             raise ValueError(f"{TERRAINS_FILE} is not the one that {PACK_FILE} names")
         arrays = read_arrays(file, ("twists", "height_unit_m", "genes"), max_bytes=_MAX_BYTES)
+        content = {"version": 1, "licence": None} | content  # which the first packs do not say, nor marks
+        for entry, mark in zip(content["terrains"], hash_elites(arrays["genes"]), strict=True):
+            entry.setdefault("mark", mark)
         units = np.cumsum(np.cumsum(arrays["twists"], axis=1), axis=2)
         heights = (units * float(arrays["height_unit_m"])).astype(np.float32)
         expected = (len(content["terrains"]), NUM_ROWS, NUM_COLS)
@@ -160,10 +163,10 @@ def evaluate_pack(
     size = len(pack.terrains)
     count, episodes = fill_sizes(compute, terrains, episodes, full=(size, EPISODES), small=(min(24, size), 4))
     check_policy(policy, robot, compute.device)
-    if trained := len(read_trained_on(policy).intersection(hash_elites(pack.genes))):
-        say((f"It was trained on {trained} of the pack's {size} terrains", "bold"), ": its rates say little.")
     terrain_set = pack_set(pack.heights, min(count, size), seed)
     entries = pack.terrains[: len(terrain_set)]
+    if trained := count_trained(entries, policy):
+        say((f"It was trained on {trained} of these {len(entries)} terrains", "bold"), ": its rates say little.")
     controller = crosser_name(robot, policy)
 
     def make_report() -> dict[str, Any]:
@@ -171,13 +174,12 @@ def evaluate_pack(
         results = cross_sets({controller: policy}, sets, robot, compute, episodes, cache=crossings_folder(robot))
         tested = add_rates(entries, {"this": results["pack"][controller]})
         keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched", "version", "licence")
-        about = {key: pack.content.get(key) for key in keys}  # the first packs have no version and licence
         return {
             **compute.origin(seed),
             **controller_identity(robot, policy),
             "episodes": episodes,
             "trained_on": trained,
-            "pack": about | {"folder": pack.name, "terrains": size},
+            "pack": {key: pack.content[key] for key in keys} | {"folder": pack.name, "terrains": size},
             "rates": summarise_rates(tested, "this", seed),
             "beside": {name: summarise_rates(entries, name, seed) for name in pack.content["rates"]},
             "by": {group: count_failing(tested, "this", group) for group in _GROUPS},
@@ -185,6 +187,12 @@ def evaluate_pack(
         }
 
     return publish(out or RUNS / f"{controller}-pack.json", make_report, show_pack_test)
+
+
+def count_trained(entries: Sequence[Entry], policy: str) -> int:
+    """On how many terrains, or the elites that these are parts of, a controller was trained, as far as it is known."""
+    marks = read_trained_on(policy)
+    return sum(entry["mark"] in marks for entry in entries)
 
 
 def passes(report: dict[str, Any], min_goal_rate: float) -> bool:
@@ -266,6 +274,16 @@ def show_pack_rates(title: str, rates: Mapping[str, dict[str, Any]]) -> None:
     show_table(title, ("", *map(MEASURES.__getitem__, RATES), "fails", "families"), rows)
 
 
+class Candidate(NamedTuple):
+    """A terrain that a pack may take."""
+
+    entry: Entry
+    genes: NDArray[np.float32]
+    """Shape (num_genes,)."""
+    of: NDArray[np.float32]
+    """Genes of the elite that it is, or a part of."""
+
+
 def make_pack(
     searches: Sequence[Search],
     controllers: Mapping[str, str],
@@ -276,76 +294,72 @@ def make_pack(
     episodes: int = EPISODES,
     seed: int = 0,
     licence: str = "",
+    version: int | None = None,
+    overwrite: bool = False,
     out: Path | None = None,
 ) -> dict[str, Any]:
     """Chooses terrains of judged searches, lets controllers cross them, and writes the pack; returns its JSON values.
 
     Without ``controllers`` (policies by name) these are the shipped one and the runs' certifiers. The searched one is
     always among them. There are ``size`` terrains, fewer if the runs have fewer, and ``episodes`` on each, which
-    ``seed`` draws; none of them is kin of an elite of ``apart_from``. Without ``out`` the folder lies under runs/.
+    ``seed`` draws; none of them is kin of an elite of ``apart_from``, nor a part of such kin. Without ``version`` it is
+    1, or the next of a pack that it is to ``overwrite``. Without ``out`` the folder lies under runs/.
     """
-    archives = [_read_judged(search) for search in searches]
     search, robot = searches[0], searches[0].robot
-    for other in searches[1:]:
-        if not (is_same_controller(other.policy, search.policy) and other.space.name == search.space.name):
-            rule = f"runs of one pack must search one controller in one space, as {search.run} does"
-            raise ValueError(f"{rule}, got {other.run} with {other.policy} in {other.space.name}: leave it out")
-    found = {name: file for search in reversed(searches) for name, file in find_certifiers(search).items()}
-    controllers = {**(controllers or {"base": str(robot.policy_file), **found})}
+    out = out or RUNS / f"{robot.name}-pack"
+    former = read_json(out / PACK_FILE).get("version", 1) if (out / PACK_FILE).exists() else 0
+    if former and not overwrite:
+        raise ValueError(f"{out} has a pack, version {former}: give another --out, or --overwrite for the next version")
+    _check_alike(searches)
+    archives = [_read_judged(one) for one in searches]
+    controllers = {**(controllers or {"base": str(robot.policy_file), **_name_certifiers(searches)})}
     if not any(is_same_controller(search.policy, policy) for policy in controllers.values()):
         controllers = {"searched": search.policy, **controllers}
     for policy in controllers.values():
         check_policy(policy, robot, compute.device)
-    candidates, not_passable = list[tuple[Entry, NDArray[np.float32]]](), 0
-    marks = {name: read_trained_on(file) for name, file in controllers.items()}
-    trained_on = set[str]().union(*(of_one for name, of_one in marks.items() if name != SPECIALIST))
-    for number, (one, archive) in enumerate(zip(searches, archives, strict=True)):
-        of_run, more = find_candidates(archive, one)
-        hashes, not_passable = hash_elites(archive.genes), not_passable + more
-        for entry, genes in of_run:
-            if hashes[entry["elite"]] not in trained_on:
-                of_several = {"name": f"run-{number}-{entry['name']}", "run": number} if len(searches) > 1 else {}
-                candidates.append((entry | of_several, genes))
-    candidates = _drop_kin(candidates, apart_from, search)
-    chosen = [candidates[index] for index in choose_terrains([entry for entry, _ in candidates], size)]
+    candidates, not_passable = find_candidates(searches, archives)
+    others = [file for name, file in controllers.items() if not name.startswith(SPECIALIST)]
+    trained_on = set[str]().union(*map(read_trained_on, others))
+    candidates = [candidate for candidate in candidates if candidate.entry["mark"] not in trained_on]
+    apart = drop_kin(candidates, apart_from, search)
+    chosen = [apart[index] for index in choose_terrains([candidate.entry for candidate in apart], size)]
     if not chosen:
         rule = "must have faults or near-faults that no controller but a specialist was trained on"
-        raise ValueError(f"{search.run} {rule}, got none and {not_passable} that nobody crosses")
-    print(f"{len(chosen)} of {len(candidates)} faults and near-faults; {not_passable} more that nobody crosses.")
-    chosen_genes = np.array([genes for _, genes in chosen], np.float32)
-    chosen_hashes = hash_elites(chosen_genes)
-    heights = round_heights(make_heights(chosen_genes, search.space))
-    out = out or RUNS / f"{robot.name}-pack"
+        got = f"none, {len(candidates)} that are kin of --making.apart-from, and {not_passable} that nobody crosses"
+        raise ValueError(f"{search.run} {rule}, got {got}")
+    print(f"{len(chosen)} of {len(apart)} faults and near-faults; {not_passable} more that nobody crosses.")
+    genes = np.array([candidate.genes for candidate in chosen], np.float32)
+    heights = round_heights(make_heights(genes, search.space))
     prepare_output(out / TERRAINS_FILE)
-    version = 1 + (read_pack(out).content.get("version") or 1 if (out / PACK_FILE).exists() else 0)
-    described = describe_controllers(controllers, robot)
 
     def make_report() -> dict[str, Any]:
         terrains = {"pack": pack_set(heights, len(heights), seed)}
         results = cross_sets(controllers, terrains, robot, compute, episodes, cache=crossings_folder(robot))
-        crossed = add_rates([entry for entry, _ in chosen], results["pack"])
+        crossed = add_rates([candidate.entry for candidate in chosen], results["pack"])
+        described = describe_controllers(controllers, robot).items()
         return {
             **compute.origin(seed),
             **controller_identity(robot, search.policy),
-            "version": version,
+            "version": version or 1 + former,
             "licence": licence or None,
             "space": search.cfg.space,
             "space_sha256": search.cfg.space_sha256,
             "episodes": episodes,
             "searched": next(name for name, policy in controllers.items() if is_same_controller(policy, search.policy)),
             "runs": [
-                {"run": one.run.name, "seed": one.cfg.seed, "iterations": archive.iterations, "elites": len(archive)}
+                {"run": one.run.name, "seed": one.cfg.seed, "iterations": archive.iterations}
+                | {"elites": len(archive), "elites_sha256": elites_sha256(archive)}
                 for one, archive in zip(searches, archives, strict=True)
             ],
+            "apart_from": [elites_sha256(archive) for archive in apart_from],
             "certifiers": sorted({name for archive in archives for name in archive.certifiers}),
-            "candidates": len(candidates),
+            "candidates": len(apart),
             "not_known_to_be_passable": not_passable,
             "controllers": {
-                name: about | {"trained_on": len(marks[name].intersection(chosen_hashes))}
-                for name, about in described.items()
+                name: about | {"trained_on": count_trained(crossed, controllers[name])} for name, about in described
             },
             "rates": {name: summarise_rates(crossed, name, seed) for name in controllers},
-            "terrains_sha256": write_terrains(out, heights, chosen_genes),
+            "terrains_sha256": write_terrains(out, heights, genes),
             "terrains": crossed,
         }
 
@@ -357,25 +371,42 @@ def make_pack(
     return publish(out / PACK_FILE, make_report, show)
 
 
-def _drop_kin(
-    candidates: list[tuple[Entry, NDArray[np.float32]]], apart_from: Sequence[Archive], search: Search
-) -> list[tuple[Entry, NDArray[np.float32]]]:
-    """Candidates that are no kin of an elite of some archives, with families over all of the runs."""
+def _check_alike(searches: Sequence[Search]) -> None:
+    """Refuses runs that cannot share a pack."""
+    first, *others = searches
+    for number, other in enumerate(others, 1):
+        if other.run.resolve() in {one.run.resolve() for one in searches[:number]}:
+            raise ValueError(f"runs of one pack must be different ones, got {other.run} twice: leave it out")
+        spaces = [(one.cfg.space, one.cfg.space_sha256, one.robot) for one in (first, other)]
+        if spaces[0] != spaces[1] or not is_same_controller(other.policy, first.policy):
+            rule = f"runs of one pack must search one controller of one robot in one space, as {first.run} does"
+            raise ValueError(f"{rule}, got {other.run} with {other.policy} in {other.cfg.space}: leave it out")
+
+
+def _name_certifiers(searches: Sequence[Search]) -> dict[str, str]:
+    """Certifiers of all runs by name, with the run's number behind the name of another controller."""
+    named = dict[str, str]()
+    for number, search in enumerate(searches):
+        for name, file in find_certifiers(search).items():
+            is_other = name in named and not is_same_controller(named[name], file)
+            named[f"{name}-run-{number}" if is_other else name] = file
+    return named
+
+
+def drop_kin(candidates: Sequence[Candidate], apart_from: Sequence[Archive], search: Search) -> list[Candidate]:
+    """Candidates that are no kin of an elite of some archives, nor parts of such kin."""
     for archive in apart_from:
-        if archive.space != search.space.name:
-            rule = f"archives to be apart from must be of the space {search.space.name}"
+        if (archive.space, archive.space_sha256) != (search.cfg.space, search.cfg.space_sha256):
+            rule = f"archives to be apart from must be of the space {search.cfg.space}"
             raise ValueError(f"{rule}, got {archive.space}: leave it out")
-    if not candidates:
-        return []
-    genes = np.array([row for _, row in candidates], np.float32)
-    others = np.concatenate([genes[:0], *(archive.genes for archive in apart_from)])
-    distances = kin_distances(np.concatenate([genes, others]), search.space)[: len(genes), len(genes) :]
-    rows = np.flatnonzero((distances >= 1.0).all(axis=1))
-    if len(rows) < len(genes):
-        print(f"{len(genes) - len(rows)} of {len(genes)} are kin of what controllers trained on.")
-    families = find_families(genes[rows], search.space).tolist() if len(rows) else []
-    left = [candidates[row] for row in rows]
-    return [(entry | {"family": family}, row) for (entry, row), family in zip(left, families, strict=True)]
+    if not candidates or not apart_from:
+        return [*candidates]
+    own = np.array([genes for candidate in candidates for genes in (candidate.genes, candidate.of)], np.float32)
+    others = np.concatenate([archive.genes for archive in apart_from])
+    distances = kin_distances(np.concatenate([own, others]), search.space)[: len(own), len(own) :]
+    is_kin = (distances < 1.0).any(axis=1).reshape(-1, 2).any(axis=1)
+    print(f"{is_kin.sum()} of {len(candidates)} are kin of what controllers trained on.")
+    return [candidates[row] for row in np.flatnonzero(~is_kin).tolist()]
 
 
 def _read_judged(search: Search) -> Archive:
@@ -392,25 +423,48 @@ def _read_judged(search: Search) -> Archive:
     return archive
 
 
-def find_candidates(archive: Archive, search: Search) -> tuple[list[tuple[Entry, NDArray[np.float32]]], int]:
-    """The faults and near-faults of a run: elites as they are, and minimal terrains that lack some of their parts.
+def find_candidates(searches: Sequence[Search], archives: Sequence[Archive]) -> tuple[list[Candidate], int]:
+    """The faults and near-faults of runs: elites as they are, and minimal terrains that lack some of their parts.
 
-    Returns an entry and the genes of each, and how many more terrains fail that nobody is known to cross.
+    Families are those of the elites of all runs; a minimal terrain is of its elite's. An elite that several runs have
+    counts once. Returns how many more terrains fail that nobody is known to cross, too.
     """
+    near: list[NDArray[np.int64]] = []
+    for archive in archives:
+        assert archive.fresh is not None
+        near.append(np.flatnonzero(archive.fresh.valid & (archive.fresh.goal_rate < NEAR_GOAL_RATE)))
+    of_all = np.concatenate([archive.genes[rows] for archive, rows in zip(archives, near, strict=True)])
+    families = find_families(of_all, searches[0].space) if len(of_all) else np.zeros(0, np.int64)
+    by_run = np.split(families, np.cumsum([len(rows) for rows in near])[:-1])
+    candidates, not_passable = dict[tuple[str, str], Candidate](), 0
+    for run, (search, archive, rows, own) in enumerate(zip(searches, archives, near, by_run, strict=True)):
+        of_run = {"run": run} if len(searches) > 1 else {}
+        found, more = _candidates_of(search, archive, dict(zip(rows.tolist(), own.tolist(), strict=True)), of_run)
+        not_passable += more
+        for candidate in found:
+            candidates.setdefault((candidate.entry["mark"], candidate.entry["kind"]), candidate)
+    return [*candidates.values()], not_passable
+
+
+def _candidates_of(
+    search: Search, archive: Archive, families: Mapping[int, int], of_run: Mapping[str, int]
+) -> tuple[list[Candidate], int]:
+    """Those of one run, whose elites have ``families`` by number; entries have ``of_run``, too."""
     assert archive.fresh is not None
-    minima = read_minimal(search.run, archive)
-    rate = archive.fresh.goal_rate
-    near = np.flatnonzero(archive.fresh.valid & (rate < NEAR_GOAL_RATE))
-    families = dict(zip(near.tolist(), find_families(archive.genes[near], search.space).tolist(), strict=True))
-    causes = rank(archive, search.space, minima, half_width=search.robot.half_width).causes if len(near) else ()
-    candidates: list[tuple[Entry, NDArray[np.float32]]] = []
+    minima, rate, witnesses = read_minimal(search.run, archive), archive.fresh.goal_rate, archive.witnesses
+    half_width = search.robot.half_width
+    causes = rank(archive, search.space, minima, half_width=half_width).causes if families else ()
+    marks, verdicts = hash_elites(archive.genes), find_verdicts(archive)
+    prefix = "".join(f"run-{number}-" for number in of_run.values())
+    candidates: list[Candidate] = []
     not_passable = 0
 
     def add(number: int, parts: list[int] | None, row: NDArray[np.float32], verdict: str, **numbers: Any) -> None:
         entry = {
-            "name": f"elite-{number}{'' if parts is None else '-minimal'}",
+            "name": f"{prefix}elite-{number}{'' if parts is None else '-minimal'}",
             "kind": "elite" if parts is None else "minimal",
             "elite": number,
+            "mark": marks[number],
             "cell": int(archive.cell[number]),
             "iteration": int(archive.iteration[number]),
             "parts": parts,
@@ -418,12 +472,15 @@ def find_candidates(archive: Archive, search: Search) -> tuple[list[tuple[Entry,
             "cause": causes[number] or None,
             "family": families[number],
         }
-        candidates.append((entry | numbers, row))
+        candidates.append(Candidate({**entry, **of_run, **numbers}, row, archive.genes[number]))
 
-    verdicts = find_verdicts(archive)
-    for number in near.tolist():
+    for number in families:
         if archive.certified[number] or rate[number] >= FAILING_GOAL_RATE:
             numbers = {"searched": rate_numbers(fresh_counts(archive, number)), **judgement(archive, number)}
+            if witnesses is not None and witnesses.on_line[number]:
+                goals = witnesses.counts[number, :, 1]  # with both kinds of physics, steered
+                numbers["witness"] = {"controller": str(witnesses.walker[number]), "limit_m": witnesses.limit_m}
+                numbers["witness"] |= {"goals": goals[:, 0].tolist(), "episodes": goals[:, 3].tolist()}
             add(number, None, archive.genes[number], VERDICTS[verdicts[number]], **numbers)
         else:
             not_passable += 1

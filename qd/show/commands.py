@@ -136,7 +136,8 @@ class ExportCommand(ControllerFlags, EliteFlags):
     formats: tuple[str, ...] = ("npz", "png", "npy", "xml", "stl", "glb", "sdf")
     """Which to write; several may stand in one, apart by spaces."""
     overwrite: bool = False
-    """Replace files of an earlier export, or the ONNX file; without it the command refuses to."""
+    """Replace files of an earlier export, the ONNX file, or a pack by its next version; without it the command refuses
+    to."""
     pack: bool = False
     """Make a pack from the run."""
     onnx: Path | None = None
@@ -182,7 +183,8 @@ class ExportCommand(ControllerFlags, EliteFlags):
         controllers = parse_controllers(making.controllers, robot) if making.controllers else {}
         compute = Compute.resolve(making.device, making.workers, making.num_envs)
         sizes: Any = {name: getattr(making, name) for name in ("size", "episodes", "seed", "licence")}
-        make_pack(searches, controllers, compute=compute, apart_from=apart_from, out=self.out, **sizes)
+        how: Any = {"compute": compute, "apart_from": apart_from, "overwrite": self.overwrite, "out": self.out}
+        make_pack(searches, controllers, **how, **sizes)
 
 
 @dataclass(frozen=True, kw_only=True)

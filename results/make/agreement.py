@@ -109,7 +109,10 @@ def measure_set(script: Script, name: str) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Crosses the sets in all ways and writes how far they agree; parts are sets, beside those measured before."""
+    """Crosses the sets in all ways and writes how far they agree; parts are sets, beside those measured before.
+
+    A file that ``lacks`` sets is made anew by results/make/all.sh.
+    """
     script = parse(__doc__, argv, "agreement.json", parts=tuple(IN_MUJOCO_C))
     sets: dict[str, Any] = {}
     for name in IN_MUJOCO_C:
@@ -118,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
             sets[name] = measure_once(script, file, partial(measure_set, script, name))
     keys = {"search": "failing", "again": "failing_again", "resolved": "failing_resolved"}
     failing = {keys[way]: count for way, count in sets.get("elites", {}).get("failing", {}).items()}
-    return script.write({**sets, **failing})
+    return script.write({**sets, **failing, "lacks": [name for name in IN_MUJOCO_C if name not in sets]})
 
 
 if __name__ == "__main__":

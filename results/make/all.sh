@@ -43,7 +43,7 @@ for robot in "${robots[@]}"; do
   if [ "$robot" = anymal ]; then
     make_file "$folder/map_training.json" map_training "$robot"       # 35 min: eight searches, six trainings
   fi
-  make_file "sim/robots/$robot/packs/2/pack.json" pack "$robot"       # 12 min: two searches
+  [ -f "sim/robots/$robot/packs/2/pack.json" ] || "$python" -m results.make.pack --robot "$robot" # 12 min: two searches
   make_file "$folder/train_speed.json" train_speed "$robot"           # 1 min; with MJLAB results.make.peer too, 3 min
   if [ "$(nvidia-smi --list-gpus | wc -l)" -gt 1 ]; then
     .venv/bin/torchrun --nproc-per-node 2 -m results.make.train_speed --robot "$robot" # 1 min on two GPUs

@@ -325,9 +325,9 @@ def read_alike(file: Path, origin: Mapping[str, Any], *names: str) -> dict[str, 
 
 
 def is_current(file: Path) -> bool:
-    """Whether a file was made by today's sources, and not in a trial."""
+    """Whether a file was made by today's sources, whole, and not in a trial."""
     content = read_made(file)
-    return content.get("sources_sha256") == sources_sha256() and not content.get("small")
+    return content.get("sources_sha256") == sources_sha256() and not (content.get("small") or content.get("lacks"))
 
 
 if __name__ == "__main__":

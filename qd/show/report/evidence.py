@@ -111,7 +111,12 @@ def tabulate(content: Mapping[str, Any], kind: str, controller: str, speed: floa
     for name, rates in sets.items():
         interval = rates.get("goal_interval") or rates.get("goal_rate_interval")
         rows.append((SETS.get(name, name), format_value(rates["goal_rate"], interval), str(rates["terrains"])))
-    return ("Pack of faults" if kind == "pack" else "Rates"), Table(("", "goal rate", "terrains"), rows)
+    title = "Rates"
+    if kind == "pack":
+        pack, trained = content["pack"], content["trained_on"]
+        title = f"Pack of faults {pack['folder']}, version {pack['version']}, terrains {pack['terrains_sha256'][:12]}"
+        title += f"; trained on {trained} of them" * bool(trained)
+    return title, Table(("", "goal rate", "terrains"), rows)
 
 
 def list_untested(contents: Sequence[tuple[str, Mapping[str, Any]]]) -> list[str]:

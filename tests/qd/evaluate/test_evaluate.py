@@ -177,7 +177,8 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
 
     def make(controllers, *others, **changes):
         searches = [*map(find_search, (path, *others))]
-        return packs.make_pack(searches, controllers, compute=compute_by(robots), out=Path("pack"), **changes)
+        how = {"compute": compute_by(robots), "out": Path("pack"), "overwrite": True}
+        return packs.make_pack(searches, controllers, **how, **changes)
 
     compute = compute_by(Robots(bump_stops))
     judge(path, stages=("resolved",), compute=compute)
@@ -205,28 +206,45 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     assert list(few["controllers"]) == ["searched", "C-G"] and few["searched"] == "searched"
     assert [entry["name"] for entry in few["terrains"]] == [entry["name"] for entry in content["terrains"][:3]]
     assert list(make({}, size=1)["controllers"]) == ["base", "C-G", "S"]  # those that certify
-    # A pack in place of another has the next version; runs are joined, and kin of both are one family.
+    # A pack in place of another has the next version. Runs are joined: what both have counts once.
     other = shutil.copytree(path, tmp_path / "other")
+    turned = replace(archive, genes=np.where(np.arange(len(archive)) % 2, 1.0, -1.0)[:, None] * archive.genes)
+    write_archive(other, replace(turned, genes=turned.genes.astype(np.float32)))
+    (other / "minimal.json").unlink()
     joined = make(base | OTHER, other, licence="CC-BY-4.0")
     assert (content["version"], joined["version"], joined["licence"]) == (1, 4, "CC-BY-4.0")
-    assert len(joined["terrains"]) == 2 * len(content["terrains"]) and joined["runs"][1]["run"] == "other"
-    names, families = (
-        [{entry[key] for entry in pack["terrains"]} for pack in (content, joined)] for key in ("name", "family")
-    )
-    assert names[1] == {f"run-{run}-{name}" for run in (0, 1) for name in names[0]} and families[0] == families[1]
-    with pytest.raises(ValueError, match="none"):  # all are kin of themselves
+    new = [entry for entry in joined["terrains"] if entry["run"] == 1]
+    assert len(content["terrains"]) + len(new) == len(joined["terrains"]) and 0 < len(new) < len(archive)
+    assert not {entry["mark"] for entry in new} & {entry["mark"] for entry in content["terrains"]}
+    for clash, named in (([path], "twice"), ([], "version 4")):
+        with pytest.raises(ValueError, match=named):
+            packs.make_pack(
+                [*map(find_search, (path, *clash))],
+                base,
+                compute=compute_by(robots),
+                out=Path("pack" if not clash else "more"),
+            )
+    with pytest.raises(ValueError, match="that are kin"):
         make(base | OTHER, apart_from=[archive])
     first = content["terrains"][0]["elite"]
     one = replace(archive, genes=np.repeat(archive.genes[[first]], len(archive), axis=0))
-    left = {entry["name"] for entry in make(base | OTHER, apart_from=[one])["terrains"]}
-    assert f"elite-{first}" not in left < names[0]
+    apart = make(base | OTHER, apart_from=[one])["terrains"]  # neither it nor its minimal terrain
+    assert first not in {entry["elite"] for entry in apart} and 0 < len(apart) < len(content["terrains"])
+    for entry in minimal:  # is of the family of its elite
+        (elite,) = (
+            whole for whole in content["terrains"] if (whole["elite"], whole["kind"]) == (entry["elite"], "elite")
+        )
+        assert (entry["family"], entry["mark"]) == (elite["family"], elite["mark"])
 
 
 def test_what_a_steered_robot_crosses_on_the_line_is_a_candidate(anymal, tmp_path):
     search = SimpleNamespace(space=SUPER_GAUSSIAN, run=tmp_path, robot=anymal)
     for archive, passable in ((judged_archive(), [0, 2, 4]), (steered_archive(), [0, 1, 2, 4])):
-        candidates, not_passable = packs.find_candidates(archive, search)
-        assert [entry["elite"] for entry, _ in candidates] == passable and not_passable == 5 - len(passable)
+        candidates, not_passable = packs.find_candidates([search], [archive])
+        assert [candidate.entry["elite"] for candidate in candidates] == passable
+        assert not_passable == 5 - len(passable)
+        steered = {candidate.entry["elite"] for candidate in candidates if "witness" in candidate.entry}
+        assert steered == ({1} if 1 in passable else set())
 
 
 @pytest.fixture
@@ -256,7 +274,7 @@ def test_a_pack_is_read_as_it_was_written(pack):
     assert packs.find_pack("anymal") == max(ROBOTS["anymal"].packs.glob("*"), key=lambda one: int(one.name))
     assert packs.find_pack("cassie@1") == ROBOTS["cassie"].packs / "1"
     assert len(packs.read_pack(packs.find_pack("cassie@1")).terrains) == 100
-    for unknown, known in (("dog", "dog"), ("cassie@0", "cassie@1")):
+    for unknown, known in (("dog", "dog"), ("cassie@0", "cassie@1"), ("cassie@", "cassie@1"), ("cassie@x", "cassie@1")):
         with pytest.raises(FileNotFoundError, match=known):
             packs.find_pack(unknown)
 

@@ -172,6 +172,16 @@ def test_noise_is_as_wide_as_it_is_said_to_be_and_old_observations_are_shown(any
     np.testing.assert_array_equal(seen["lag"][3:], seen["none"][1:3])
 
 
+def test_old_observations_grow_no_older_behind_the_goal(anymal):
+    """Robots that are paid walk on behind it, as well as before."""
+    how = {"num_terrains": 2, "replicas": 1, "device": "cpu", "space": SPACE, "cfg": CrossingCfg(reward=True)}
+    result = Rollout(anymal, anymal.policy_file, **how).evaluate(
+        under_conditions(np.stack([genes(), genes(lag=0.04)]), np.array([5, 5], np.uint32))
+    )
+    nominal, lagged = result.reward[:, 0]
+    assert result.reached_goal.all() and 0.8 * nominal < lagged < nominal
+
+
 def test_weak_motors_give_a_share_of_what_they_gave_at_their_limits_too(anymal, device):
     rows = np.stack([genes(), genes(strength=0.6)])
     rollout = Rollout(anymal, anymal.policy_file, num_terrains=2, replicas=1, device=device, space=SPACE)

@@ -72,7 +72,7 @@ def observe(sim, heights, row, poses):
         sim.begin_conditions(wp.ones(EPISODES, dtype=int))
         seen = []
         for number, at in enumerate(poses):
-            episodes.steps.fill_(number * sim.robot.decimation)
+            sim.disturbed.steps.fill_(number * sim.robot.decimation)
             joint_q, joint_qd = sim.joint_q.numpy(), np.zeros(sim.joint_qd.shape, np.float32)
             joint_q[:, :7], joint_qd[:, :3] = at, (0.5, -0.2, 0.1)
             sim.joint_q.assign(joint_q)
