@@ -36,6 +36,8 @@ from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
 
 DEVICE = os.environ.get("FAULTLINE_DEVICE", "cpu")
+WORKERS = ("sim.simulation", "sim.rollout", "qd.workers.crosser")
+"""What worker processes load."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -88,7 +90,7 @@ def forked_workers():
     """On the CPU worker processes are forks of one that has loaded Newton, which takes most of their start."""
     with pytest.MonkeyPatch.context() as patch:
         if DEVICE == "cpu":
-            patch.setattr(process, "CONTEXT", fork_from("sim.simulation", "sim.rollout", "qd.workers.crosser"))
+            patch.setattr(process, "CONTEXT", fork_from(*WORKERS))
         yield
 
 
@@ -97,7 +99,7 @@ def nursery(forked_workers):
     """Processes are forks of one that has searched before (tests.kills.nursery)."""
     fork_from("tests.kills.nursery")
     yield
-    fork_from("sim.simulation", "sim.rollout", "qd.workers.crosser")
+    fork_from(*WORKERS)
 
 
 def fork_from(*modules: str) -> Any:

@@ -335,7 +335,8 @@ def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], fold
     """
     for old in folder.glob("*.npz"):
         old.unlink()
-    for number, (found, (terrains, *_)) in enumerate(zip(report["checks"], drawn, strict=False), 1):
+    for number, (found, of_check) in enumerate(zip(report["checks"], drawn, strict=False), 1):
+        terrains = of_check.terrains
         if found["passes"] or terrains.space.has_conditions or terrains.space.ground:
             continue
         failing = sorted(found["failing"], key=lambda row: (-row.get("old_goals", 0), row["goals"] / row["episodes"]))

@@ -7,11 +7,10 @@ import threading
 from collections.abc import Callable, Hashable
 from concurrent.futures import CancelledError
 from functools import partial
-from multiprocessing import get_context
 from multiprocessing.synchronize import Event
 from typing import Any, NamedTuple
 
-from qd.workers.process import EvaluatorError, WorkerProcess
+from qd.workers.process import CONTEXT, EvaluatorError, WorkerProcess
 
 _PREPARING = "the simulation is built; the very first one compiles its kernels, up to some minutes"
 
@@ -74,7 +73,7 @@ class Recorder:
         self.report: Callable[[TaskProgress], None] = lambda progress: None
         """Called in another thread, at every step forward."""
         self._build = build
-        self._cancelled = get_context("spawn").Event()
+        self._cancelled = CONTEXT.Event()
         self._requests: dict[Hashable, Any] = {}  # by key, the oldest first
         self._current: Any = None
         self._stopped = False
