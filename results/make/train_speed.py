@@ -1,6 +1,8 @@
 """How fast training is, simulation and learning together: train_speed.json, by number of GPUs and robots.
 
 On several GPUs: torchrun --nproc-per-node 2 -m results.make.train_speed; its rows join those of one GPU.
+``--parts gate`` measures in place of it what a gate of the published pack costs a training of as many robots: called
+every 500 iterations on its GPU, and every 50 on another device.
 Beside mjlab, in the same run: pip install --target FOLDER mjlab==1.6.0, and MJLAB=FOLDER before the command. It trains
 in a process of its own, since it wants other versions of packages (peer.py).
 """
@@ -10,11 +12,14 @@ import os
 import statistics
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from qd.evaluate.gate import gate
 from results.make import peer
 from results.make.common import Script, parse
 from sim.files.provenance import device_name
@@ -24,10 +29,17 @@ from train.task.task import CommandTask, TaskCfg
 WARM_UP = 10
 SIZES = ((4096, peer.STEPS), (8192, PpoCfg.steps_per_env))
 """Robots a GPU and steps an iteration: those of mjlab, and those of a training."""
+GATE = """seed = {seed}
+[[check]]
+pack = "{robot}@1"
+limit = 0.5
+"""
+GATED = {"same_gpu": (500, 3), "other_device": (50, 8)}
+"""How many iterations lie between two gates, and how many gates are timed."""
 
 
-def time_training(script: Script, device: str, num_envs: int, steps: int, iterations: int) -> dict[str, Any]:
-    """Median time of an iteration of some steps and what follows from it.
+def make_learner(script: Script, device: str, num_envs: int, steps: int) -> tuple[Learner, PpoCfg]:
+    """A training that has begun, and its settings.
 
     The shipped controller walks the robots, so that contacts are those of the better part of a training; its weights go
     on being trained.
@@ -37,7 +49,15 @@ def time_training(script: Script, device: str, num_envs: int, steps: int, iterat
     learner = Learner(CommandVecEnv(task), cfg, seed=script.seed)
     shipped = torch.load(script.policy, map_location="cpu", weights_only=True)["actor_state_dict"]
     learner.alg.get_policy().load_state_dict(shipped)
-    timed = [learner.iterate() for _ in range(WARM_UP + iterations)][WARM_UP:]
+    for _ in range(WARM_UP):
+        learner.iterate()
+    return learner, cfg
+
+
+def time_training(script: Script, device: str, num_envs: int, steps: int, iterations: int) -> dict[str, Any]:
+    """Median time of an iteration of some steps and what follows from it."""
+    learner, cfg = make_learner(script, device, num_envs, steps)
+    timed = [learner.iterate() for _ in range(iterations)]
     seconds = statistics.median(step.collection_s + step.learning_s for step in timed)
     return {
         "gpus": learner.ranks.size,
@@ -51,6 +71,57 @@ def time_training(script: Script, device: str, num_envs: int, steps: int, iterat
     }
 
 
+def time_gates(script: Script, device: str) -> dict[str, Any]:
+    """What gates cost a training: ``cost`` is the share by which iterations are slower with them.
+
+    On the training's GPU one gate at a time runs, between stretches without one; its cost is spread over the iterations
+    between two calls. On the other device gates are called as often as they are to be, whether or not those before them
+    have ended.
+    """
+    learner, _ = make_learner(script, device, *((8, 24) if script.small else SIZES[-1]))
+
+    def iterate(count: int) -> list[float]:
+        steps = [learner.iterate() for _ in range(count)]
+        return [step.collection_s + step.learning_s for step in steps]
+
+    rows = dict[str, Any]()
+    with tempfile.TemporaryDirectory() as folder:
+        others = {"same_gpu": device, "other_device": "cuda:1" if torch.cuda.device_count() > 1 else "cpu"}
+        for name, (every, count) in GATED.items():
+            every, count = (1, 1) if script.small else (every, count)
+            called: list[Any] = []
+            alone, beside = iterate(2 if script.small else 100), list[float]()
+
+            def call(name: str = name, called: list[Any] = called) -> None:
+                out = Path(folder, f"{name}-{len(called)}.json")
+                file = out.with_suffix(".toml")
+                seed = script.origin["seed"] + 1000 * (name == "same_gpu") + len(called)  # nothing is in the cache
+                file.write_text(GATE.format(seed=seed, robot=script.robot.name))
+                called.append(gate(script.policy, script.robot.name, file, out=out, device=others[name]))
+
+            for _ in range(count):
+                call()
+                if name == "other_device":
+                    beside += iterate(every)
+                    continue
+                while not called[-1].ended:
+                    beside += iterate(1)
+                alone += iterate(2 if script.small else 100)
+            wait_s = [each.result(600.0)["checks"][0]["wall_s"] for each in called]
+            slower = sum(beside) - len(beside) * statistics.mean(alone)
+            rows[name] = {
+                "device": device_name(others[name]),
+                "every": every,
+                "gates": count,
+                "check_s": statistics.median(wait_s),
+                "iteration_s_alone": statistics.mean(alone),
+                "iteration_s_beside": statistics.mean(beside),
+                "iterations_beside": len(beside) / count,
+                "cost": slower / (count * every * statistics.mean(alone)),
+            }
+    return {"num_envs": learner.env.num_envs, **rows}
+
+
 def time_mjlab(folder: str, device: str, num_envs: int) -> dict[str, Any]:
     """The same of mjlab, which lies in a folder."""
     path = os.pathsep.join([folder, *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -62,23 +133,28 @@ def time_mjlab(folder: str, device: str, num_envs: int) -> dict[str, Any]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Times both sizes, and mjlab if there is one; each row says which run it is of."""
-    script = parse(__doc__, argv, "train_speed.json")
+    script = parse(__doc__, argv, "train_speed.json", parts=("gate",))
     ranks = Ranks.from_environment()
     sizes, iterations = (((8, 24), (16, 24)), 1) if script.small else (SIZES, 40)
     if ranks.size > 1:  # several processes make one training alone
         sizes = sizes[-1:]
     device = ranks.device(script.device)
+    before = script.read_so_far(script.out, "versions")
+    before = {name: before[name] for name in ("rows", "gate") if name in before}
+    origin = {name: script.origin[name] for name in ("command", "commit", "date")}
+    if script.parts:
+        script.write(before | {"gate": time_gates(script, device) | origin})
+        return
     rows = [time_training(script, device, *size, iterations) for size in sizes]
     if ranks.size == 1 and (folder := os.environ.get("MJLAB")):
         rows.append(time_mjlab(folder, device, sizes[0][0]))
-    origin = {name: script.origin[name] for name in ("command", "commit", "date")}
     if ranks.size > 1:
         origin["command"] = origin["command"].replace("python", f"torchrun --nproc-per-node {ranks.size}", 1)
     rows = [row | origin for row in rows]  # those of other runs stand beside them
     if ranks.is_first:
         gpus = {row["gpus"] for row in rows}
-        before = script.read_so_far(script.out, "versions").get("rows", [])
-        script.write({"rows": [*(row for row in before if row["gpus"] not in gpus), *rows]})
+        kept = [row for row in before.get("rows", ()) if row["gpus"] not in gpus]
+        script.write(before | {"rows": [*kept, *rows]})
 
 
 if __name__ == "__main__":
