@@ -1,8 +1,8 @@
 """How fast training is, simulation and learning together: train_speed.json, by number of GPUs and robots.
 
 On several GPUs: torchrun --nproc-per-node 2 -m results.make.train_speed; its rows join those of one GPU.
-``--parts gate`` measures in place of it what a gate of the published pack costs a training of as many robots: called
-every 500 iterations on its GPU, and every 50 on another device.
+``--parts gate`` measures in place of it what a gate of the published pack costs a training, called every 500 iterations
+on its GPU, and every 50 on another device: gate.json.
 Beside mjlab, in the same run: pip install --target FOLDER mjlab==1.6.0, and MJLAB=FOLDER before the command. It trains
 in a process of its own, since it wants other versions of packages (peer.py).
 """
@@ -14,12 +14,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from qd.evaluate.gate import gate
+from qd.evaluate.gate import GateProcess, gate
 from results.make import peer
 from results.make.common import Script, parse
 from sim.files.provenance import device_name
@@ -85,35 +86,29 @@ def time_gates(script: Script, device: str) -> dict[str, Any]:
         return [step.collection_s + step.learning_s for step in steps]
 
     rows = dict[str, Any]()
+    others = {"same_gpu": device, "other_device": "cuda:1" if torch.cuda.device_count() > 1 else "cpu"}
+    pause = 2 if script.small else 100
     with tempfile.TemporaryDirectory() as folder:
-        others = {"same_gpu": device, "other_device": "cuda:1" if torch.cuda.device_count() > 1 else "cpu"}
-        for name, (every, count) in GATED.items():
+        for first, (name, (every, count)) in enumerate(GATED.items()):
             every, count = (1, 1) if script.small else (every, count)
-            called: list[Any] = []
-            alone, beside = iterate(2 if script.small else 100), list[float]()
-
-            def call(name: str = name, called: list[Any] = called) -> None:
-                out = Path(folder, f"{name}-{len(called)}.json")
-                file = out.with_suffix(".toml")
-                seed = script.origin["seed"] + 1000 * (name == "same_gpu") + len(called)  # nothing is in the cache
-                file.write_text(GATE.format(seed=seed, robot=script.robot.name))
-                called.append(gate(script.policy, script.robot.name, file, out=out, device=others[name]))
-
-            for _ in range(count):
-                call()
+            alone, beside, called = iterate(pause), list[float](), list[GateProcess]()
+            for k in range(count):
+                file = Path(folder, f"{name}-{k}.toml")
+                file.write_text(GATE.format(seed=1000 * first + k, robot=script.robot.name))  # nothing is in the cache
+                how = {"out": file.with_suffix(".json"), "device": others[name]}
+                called.append(gate(script.policy, script.robot.name, file, **how))
                 if name == "other_device":
                     beside += iterate(every)
                     continue
                 while not called[-1].ended:
                     beside += iterate(1)
-                alone += iterate(2 if script.small else 100)
-            wait_s = [each.result(600.0)["checks"][0]["wall_s"] for each in called]
+                alone += iterate(pause)
             slower = sum(beside) - len(beside) * statistics.mean(alone)
             rows[name] = {
                 "device": device_name(others[name]),
                 "every": every,
                 "gates": count,
-                "check_s": statistics.median(wait_s),
+                "check_s": statistics.median(each.result(600.0)["checks"][0]["wall_s"] for each in called),
                 "iteration_s_alone": statistics.mean(alone),
                 "iteration_s_beside": statistics.mean(beside),
                 "iterations_beside": len(beside) / count,
@@ -139,22 +134,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     if ranks.size > 1:  # several processes make one training alone
         sizes = sizes[-1:]
     device = ranks.device(script.device)
-    before = script.read_so_far(script.out, "versions")
-    before = {name: before[name] for name in ("rows", "gate") if name in before}
-    origin = {name: script.origin[name] for name in ("command", "commit", "date")}
     if script.parts:
-        script.write(before | {"gate": time_gates(script, device) | origin})
+        replace(script, out=script.out.with_name("gate.json")).write(time_gates(script, device))
         return
     rows = [time_training(script, device, *size, iterations) for size in sizes]
     if ranks.size == 1 and (folder := os.environ.get("MJLAB")):
         rows.append(time_mjlab(folder, device, sizes[0][0]))
+    origin = {name: script.origin[name] for name in ("command", "commit", "date")}
     if ranks.size > 1:
         origin["command"] = origin["command"].replace("python", f"torchrun --nproc-per-node {ranks.size}", 1)
     rows = [row | origin for row in rows]  # those of other runs stand beside them
     if ranks.is_first:
         gpus = {row["gpus"] for row in rows}
-        kept = [row for row in before.get("rows", ()) if row["gpus"] not in gpus]
-        script.write(before | {"rows": [*kept, *rows]})
+        before = script.read_so_far(script.out, "versions").get("rows", [])
+        script.write({"rows": [*(row for row in before if row["gpus"] not in gpus), *rows]})
 
 
 if __name__ == "__main__":
