@@ -22,10 +22,10 @@ from qd.workers.compute import Compute, check_policy
 from qd.workers.crosser import Crosser
 from qd.workers.invalid import refuse_all_invalid
 from sim.controllers.spec import controller_identity, crosser_name
-from sim.crossing import CrossingCfg
+from sim.crossing import CrossingCfg, resolved
 from sim.files.atomic import prepare_output, read_json, to_json, write_atomically
 from sim.files.templates import open_templates
-from sim.robots.find import read_penalty_scales
+from sim.robots.find import STRAY, read_penalty_scales
 from sim.robots.robot import RobotCfg
 from sim.robots.user import describe_inferred, write_setting
 from sim.rollout import Rollout, RolloutResult
@@ -118,24 +118,30 @@ def ensure_ready(robot: RobotCfg, policy: str | None, compute: Compute, *, skip_
 def ensure_stray(robot: RobotCfg, policy: str | None, compute: Compute) -> None:
     """Measures how far routes may be missed, and writes it to the penalty scales, if they do not say it."""
     content = read_json(robot.scales_file)
-    if "stray_m" not in content:
+    missing = {key: is_resolved for is_resolved, key in STRAY.items() if key not in content}
+    if missing:
         print(f"How well robot '{robot.name}' follows commands on level ground is measured first.", flush=True)
-        stray_m = measure_stray(robot, policy or str(robot.policy_file), compute.device)
-        write_atomically(robot.scales_file, to_json(content | {"stray_m": stray_m, "stray_routes": _ROUTES}))
+        policy = policy or str(robot.policy_file)
+        measured = {key: measure_stray(robot, policy, compute.device, resolve=by) for key, by in missing.items()}
+        write_atomically(robot.scales_file, to_json(content | measured | {"stray_routes": _ROUTES}))
 
 
-def measure_stray(robot: RobotCfg, policy: str, device: str) -> float:
+def measure_stray(robot: RobotCfg, policy: str, device: str, *, resolve: bool = False) -> float:
     """How far displacements over two seconds are from those commanded on level ground [m]: 99 % are nearer.
 
-    They are of hard-random routes, one episode each, at every control step before it ends.
+    They are of hard-random routes, one episode each, at every control step before it ends; in the search's physics or,
+    to ``resolve`` contact, in finer one.
     """
+    solver = None
+    if resolve:
+        robot, solver = resolved(robot)
     space = get_space(f"{SUPER_GAUSSIAN.name}+command")
     rows = space.condition_rows(space.hard_random(_ROUTES, 0))
     ground = replace(GroundMaps.plain(_ROUTES), conditions=rows)
     seeds = np.random.SeedSequence(0).generate_state(_ROUTES, np.uint32)
     terrains = Terrains(heights=np.zeros((_ROUTES, NUM_ROWS, NUM_COLS), np.float32), seeds=seeds, ground=ground)
     how: Any = {"num_terrains": _ROUTES, "replicas": 1, "cfg": CrossingCfg(stray_m=math.inf), "with_conditions": True}
-    rollout, errors = Rollout(robot, policy, device=device, **how), list[NDArray[np.float32]]()
+    rollout, errors = Rollout(robot, policy, device=device, solver=solver, **how), list[NDArray[np.float32]]()
     assert rollout.trail is not None
     trail = rollout.trail
 

@@ -229,7 +229,9 @@ class Rollout:
             self._ranges = make_start_ranges(self.cfg, robot)
             self._robot_step = sim.make_step(self.command, self._last_action)
             routes = self.cfg.stray_m is None and self.space.asks == Kind.ROUTE
-            task_cfg = replace(self.cfg, stray_m=read_stray(robot)) if routes else self.cfg
+            is_resolved = solver is not None and solver.time_constant_s is not None
+            stray = {"stray_m": read_stray(robot, resolved=is_resolved)} if routes else {}
+            task_cfg = replace(self.cfg, **stray)
             self._task = make_task(task_cfg, robot)
             self._episode = self._stepped = make_episodes(num_envs)
             self.outcome = self._episode.outcome

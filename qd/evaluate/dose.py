@@ -183,7 +183,7 @@ def measure_dose(
     count, episodes = fill_sizes(compute, terrains, episodes, full=_FULL, small=_SMALL)
     conditions = [name for name in doses if name in CONDITIONS]
     if any(CONDITIONS[name].asks == Kind.ROUTE for name in conditions):
-        read_stray(robot)  # or refuses
+        read_stray(robot, resolved=resolved)  # or refuses
     for policy in controllers.values():
         check_conditions(conditions, robot, observed_terms(policy))
         check_policy(policy, robot, compute.device)

@@ -147,7 +147,7 @@ class Crosser(ExitStack):
         settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s]
         terms = repr(self.robot.training) if cfg.reward else None  # that the reward has
         settings += [terms, code_fingerprint(("kernels", "sim"))]
-        settings += [read_stray(self.robot)] if terrains.space.asks == Kind.ROUTE else []
+        settings += [read_stray(self.robot, resolved=cfg.is_resolved)] if terrains.space.asks == Kind.ROUTE else []
         key = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:32]
         if key not in self._stored:
             self._stored[key] = StoredCrossings(self._cache, key, self.robot.penalties)

@@ -68,6 +68,11 @@ class PipelineCfg:
             raise ValueError("engine mujoco_c sums no reward, sums penalties from the start only, and records nothing")
 
     @property
+    def is_resolved(self) -> bool:
+        """Whether contact is resolved (:func:`sim.crossing.resolved`)."""
+        return self.engine in ("resolved", "mujoco_c")
+
+    @property
     def on_mujoco_c(self) -> bool:
         """Whether MuJoCo C crosses, which has no GPU and no part in Ray."""
         return self.engine.startswith("mujoco_c")
@@ -136,7 +141,7 @@ def build_simulator(cfg: PipelineCfg, num_terrains: int) -> Simulator:
     """The simulator of a pipeline, for a share of its terrains."""
     robot = get_robot(cfg.robot)
     solver = SolverCfg()
-    if cfg.engine in ("resolved", "mujoco_c"):
+    if cfg.is_resolved:
         robot, solver = resolved(robot)
     if cfg.on_mujoco_c:
         return MujocoC(robot, cfg.policy, replicas=cfg.replicas, solver=solver)

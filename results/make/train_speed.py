@@ -135,7 +135,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         sizes = sizes[-1:]
     device = ranks.device(script.device)
     if script.parts:
-        replace(script, out=script.out.with_name("gate.json")).write(time_gates(script, device))
+        replace(script, out=script.out.with_name("gate.json")).write({"gate": time_gates(script, device)})
         return
     rows = [time_training(script, device, *size, iterations) for size in sizes]
     if ranks.size == 1 and (folder := os.environ.get("MJLAB")):

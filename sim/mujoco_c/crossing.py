@@ -253,7 +253,8 @@ def cross_in_mujoco_c(
     max_steps = round(robot.max_duration_s / robot.physics_dt)
     highest = find_highest_command(CrossingCfg(), robot)
     row = nominal_row() if ground is None else ground.rows[0]
-    stray_m = read_stray(robot) if row[-1] == Kind.ROUTE else math.inf
+    is_resolved = time_constant_s is not None
+    stray_m = read_stray(robot, resolved=is_resolved) if row[-1] == Kind.ROUTE else math.inf
     routes = Routes(robot, row.astype(np.float64), count, stray_m)
     for step in range(0, max_steps, robot.decimation):
         if len(running := np.flatnonzero(outcome == Outcome.RUNNING)) == 0:

@@ -12,6 +12,9 @@ from sim.files.command import command_line
 from sim.files.settings import PositiveFloat
 from sim.robots.robot import ROBOTS, RobotCfg, check_robot_identity
 
+STRAY = {False: "stray_m", True: "stray_resolved_m"}
+"""Keys of penalty scales, by whether contact is resolved: how far a route may be missed [m]."""
+
 
 def get_robot(spec: str | RobotCfg | None) -> RobotCfg:
     """Settings of a robot that the command line names; :func:`resolve_robot` is for what a file names.
@@ -68,13 +71,16 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
         raise ValueError(f"{robot.scales_file} needs a positive scale for {names}: {error}; {remedy}") from None
 
 
-def read_stray(robot: RobotCfg) -> float:
-    """How far a displacement over two seconds may lie from the one that a route commands [m] (``qd.check``)."""
-    content = read_json(robot.scales_file) if robot.scales_file.exists() else {}
-    if "stray_m" not in content:
+def read_stray(robot: RobotCfg, *, resolved: bool = False) -> float:
+    """How far a displacement over two seconds may lie from the one that a route commands [m] (``qd.check``).
+
+    It is that of the search's physics, or with contact ``resolved``: robots walk a little slower or faster then.
+    """
+    content, key = read_json(robot.scales_file) if robot.scales_file.exists() else {}, STRAY[resolved]
+    if key not in content:
         remedy = f"run `{command_line('archive', robot=robot.spec, space='super_gaussian+command')}`"
-        raise ValueError(f"{robot.scales_file} must say how far a route may be missed, got no stray_m: {remedy} first")
-    return float(content["stray_m"])
+        raise ValueError(f"{robot.scales_file} must say how far a route may be missed, got no {key}: {remedy} first")
+    return float(content[key])
 
 
 def fitting_space(robot: RobotCfg) -> str | None:
