@@ -1,9 +1,10 @@
 """Conditions under which robots cross: they vary a robot where its episode begins, and disturb its steps.
 
 A terrain has a row of numbers, the values of all conditions (:mod:`sim.terrains.conditions`). A condition has some
-of four Warp functions, which read their numbers from column ``first`` on:
+of five Warp functions, which read their numbers from column ``first`` on:
 
     begin(robot: VariedRobots, row: wp.array[float], first: int, terrain: int, env: int)
+    meet(step: DisturbedStep, row: wp.array[float], first: int, env: int)
     disturb(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int)
     drive(step: ForcedStep, row: wp.array[float], first: int, env: int)
     force(step: ForcedStep, row: wp.array[float], first: int, env: int)
@@ -60,6 +61,19 @@ class VariedRobots:
 
 
 @wp.struct
+class MapView:
+    """Where a height scan reads its map: point (x, y) of the scan at origin + x axis + y (axis turned to the left)."""
+
+    origin: wp.vec2
+    """World-local [m]."""
+    axis: wp.vec2
+    height: float
+    """Of the base over the map's zero [m]."""
+    tilt: wp.vec2
+    """How much higher the base seems over a point for each metre that it lies ahead and to the left."""
+
+
+@wp.struct
 class Disturbed:
     """What the conditions of running episodes remember."""
 
@@ -75,6 +89,8 @@ class Disturbed:
     """Where the height map had the robot at the last control steps, shape (num_envs, 1 + max_map_steps)."""
     map_drift: wp.array2d[wp.spatial_vector]
     """Drift of the map over its size, of this control step and the next in turns, shape (num_envs, 2)."""
+    map_view: wp.array[MapView]
+    """Where the scan reads the map in this control step, shape (num_envs,)."""
     held: wp.array2d[float]
     """Height of the base over the ground as each scan point last had it [m], shape (num_envs, num_scan_points)."""
     is_misled: wp.array[int]
@@ -178,8 +194,22 @@ def make_begin(effects: Effects) -> Callable[..., None]:
 
 
 @cache
+def make_meet(effects: Effects) -> Callable[..., None]:
+    """What meets each robot before its next control step: it changes the velocities ``joint_qd``, or is remembered."""
+
+    @kernel_over("step.memory.steps", module="unique")
+    def meet(step: DisturbedStep):
+        """Grid (num_envs,)."""
+        env = wp.tid()
+        for k in range(wp.static(len(effects))):
+            wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
+
+    return meet
+
+
+@cache
 def make_disturb(effects: Effects) -> Callable[..., None]:
-    """What disturbs the next control step of all robots: their velocities ``joint_qd`` and what they observe."""
+    """What disturbs the observation of the next control step."""
 
     @kernel_over("step.observation", module="unique")
     def disturb(step: DisturbedStep):

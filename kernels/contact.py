@@ -46,6 +46,8 @@ class Contacts:
 
     count: wp.array[int]
     """Number of contacts of each robot, shape (num_envs,); contacts beyond the capacity are counted, but not stored."""
+    rank: wp.array2d[int]
+    """Place among all contacts that the robot can have, by which they are worked on: threads find them in any order."""
     shape: wp.array2d[int]
     """Collision shape, counted within one robot."""
     point: wp.array2d[wp.vec3]
@@ -80,14 +82,16 @@ class Surfaces:
 
 @wp.func
 def _write_contact(
-    contacts: Contacts, slot: int, strip: int, probe: int, pose: wp.transform, terrain: Terrain, ground: Ground, t: int,
-    env: int, probes: Probes,
+    contacts: Contacts, first: int, nth: int, strip: int, probe: int, pose: wp.transform, terrain: Terrain,
+    ground: Ground, t: int, env: int, probes: Probes,
 ):  # fmt: skip
+    slot = first + nth
     if slot < contacts.shape.shape[1]:
         radius = probes.strip_radius[strip]
         centre = wp.transform_point(pose, probes.position[probe])
         point = nearest_surface_point(terrain, t, centre, radius)
         touched = centre - point.normal * point.distance
+        contacts.rank[env, slot] = 3 * strip + nth
         contacts.shape[env, slot] = probes.strip_shape[strip]
         contacts.point[env, slot] = 0.5 * (touched + centre - point.normal * radius)
         contacts.normal[env, slot] = point.normal
@@ -139,14 +143,13 @@ def _collide_strip(
                 deepest = k
     if first < 0:
         return
-    slot = wp.atomic_add(contacts_out.count, env, 1 + int(first != deepest) + int(last != deepest))
-    _write_contact(contacts_out, slot, strip, deepest, pose, terrain, ground, t, env, probes)
+    count = 1 + int(first != deepest) + int(last != deepest)
+    slot = wp.atomic_add(contacts_out.count, env, count)
+    _write_contact(contacts_out, slot, 0, strip, deepest, pose, terrain, ground, t, env, probes)
     if first != deepest:
-        slot += 1
-        _write_contact(contacts_out, slot, strip, first, pose, terrain, ground, t, env, probes)
+        _write_contact(contacts_out, slot, 1, strip, first, pose, terrain, ground, t, env, probes)
     if last != deepest:
-        slot += 1
-        _write_contact(contacts_out, slot, strip, last, pose, terrain, ground, t, env, probes)
+        _write_contact(contacts_out, slot, count - 1, strip, last, pose, terrain, ground, t, env, probes)
 
 
 @wp.kernel
@@ -195,13 +198,24 @@ def make_contacts(num_envs: int, capacity: int) -> Contacts:
 
 @kernel_over("geom_force_out")
 def sum_forces(contacts: Contacts, column_of_shape: wp.array[int], geom_force_out: wp.array2d[wp.vec3]):
-    """Grid (num_envs, num_geoms): sum the contact forces on each geom.
+    """Grid (num_envs, num_geoms): sum the contact forces on each geom, in the order of ranks.
 
     ``column_of_shape`` is the geom's column for each collision shape, -1 for none.
     """
     env, column = wp.tid()
+    count = wp.min(contacts.count[env], contacts.shape.shape[1])
     force = wp.vec3(0.0)
-    for c in range(wp.min(contacts.count[env], contacts.shape.shape[1])):
-        if column_of_shape[contacts.shape[env, c]] == column:
-            force += contacts.force[env, c]
+    added = int(-1)  # rank of the last contact
+    for _ in range(count):
+        following = int(-1)
+        least = int(2147483647)
+        for c in range(count):
+            rank = contacts.rank[env, c]
+            if rank > added and rank < least and column_of_shape[contacts.shape[env, c]] == column:
+                following = c
+                least = rank
+        if following < 0:
+            break
+        force += contacts.force[env, following]
+        added = least
     geom_force_out[env, column] = force

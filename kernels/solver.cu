@@ -8,7 +8,7 @@ enum { SATISFIED, QUADRATIC, CONE };
 struct alignas(16) Float4 { float v[4]; };
 struct alignas(16) Contact {
     float jacobian[DIM][LD], jaref[DIM], jv[DIM], force[DIM], d[DIM], friction[DIM];  // friction[0]: the cone's mu
-    int state;
+    int state, slot;  // slot: where it lies in problem.contacts
 };
 using LaneVector = float[PER_LANE];
 using Row = float[LANES == 1 ? LD : NV];  // one row of a matrix; with its end a CPU takes four numbers at once
@@ -535,6 +535,12 @@ const float scale = 1.0f / wp::max(MINVAL, total(trace));
 #pragma unroll 1
 for (int begin = 0; begin < num_contacts; begin += LANES) {  // each lane reads one contact and shares it
     const int index = wp::min(begin + lane, num_contacts - 1), shape = wp::index(problem.contacts.shape, world, index);
+    const int rank = wp::index(problem.contacts.rank, world, index);
+    int place = 0;  // in the order of ranks, so that sums over contacts repeat
+    for (int c = 0; c < num_contacts; ++c) {
+        const int other = wp::index(problem.contacts.rank, world, c);
+        place += other < rank || (other == rank && c < index);
+    }
     const int body = problem.surfaces.body.data[shape], condim = problem.surfaces.condim.data[shape];
     const Vec normal = wp::index(problem.contacts.normal, world, index);
     const Vec arm = wp::index(problem.contacts.point, world, index)
@@ -542,7 +548,8 @@ for (int begin = 0; begin < num_contacts; begin += LANES) {  // each lane reads 
     auto shuffle_vector = [&](const Vec& v, int s) { return Vec(shuffle(v[0], s), shuffle(v[1], s), shuffle(v[2], s)); };
     #pragma unroll 1
     for (int s = 0; s < wp::min(LANES, num_contacts - begin); ++s) {
-        Contact& contact = get_contact(begin + s);
+        Contact& contact = get_contact((int)shuffle((float)place, s));
+        if (lane == 0) contact.slot = begin + s;
         const Vec offset = shuffle_vector(arm, s);
         const int touching = (int)shuffle((float)body, s), dim = (int)shuffle((float)condim, s);
         Vec frame[3];
@@ -566,17 +573,18 @@ write_vector(speed);
 #pragma unroll 1
 for (int c = lane; c < num_contacts; c += LANES) {
     Contact& contact = get_contact(c);
-    const int shape = wp::index(problem.contacts.shape, world, c), dim = problem.surfaces.condim.data[shape];
+    const int slot = contact.slot, shape = wp::index(problem.contacts.shape, world, slot);
+    const int dim = problem.surfaces.condim.data[shape];
     Vec2 solref = model_value(problem.surfaces.solref, shape);
     Vec5 solimp = model_value(problem.surfaces.solimp, shape);
     const Vec5& friction = model_value(problem.surfaces.friction, shape);
-    const float factor = wp::index(problem.contacts.friction, world, c);
-    const float soft = wp::index(problem.contacts.time_constant, world, c);
+    const float factor = wp::index(problem.contacts.friction, world, slot);
+    const float soft = wp::index(problem.contacts.time_constant, world, slot);
     if (soft > wp::max(solref[0], 0.0f)) {  // soft ground has constant impedance
         solref = Vec2(soft, 1.0f);
         solimp[0] = solimp[1];
     }
-    const float distance = wp::index(problem.contacts.distance, world, c);
+    const float distance = wp::index(problem.contacts.distance, world, slot);
     const Spring s = make_spring(solref, solimp, distance);
     const auto& weights = model_value(problem.body_invweight0, problem.surfaces.body.data[shape]);
     const float d = compute_stiffness(weights[0] + model_value(problem.body_invweight0, 0)[0], s.impedance);
@@ -682,8 +690,8 @@ while (true) {
 for (int c = lane; c < num_contacts; c += LANES) {
     const Contact& contact = get_contact(c);
     Vec frame[3];
-    make_frame(wp::index(problem.contacts.normal, world, c), frame);
-    wp::index(problem.contacts.force, world, c) =
+    make_frame(wp::index(problem.contacts.normal, world, contact.slot), frame);
+    wp::index(problem.contacts.force, world, contact.slot) =
         frame[0] * contact.force[0] + frame[1] * contact.force[1] + frame[2] * contact.force[2];
 }
 

@@ -90,7 +90,7 @@ class Sizes:
 
     @property
     def _floats_per_contact(self) -> int:
-        return 4 * math.ceil((self.dimensions * (self.stride + 5) + 1) / 4)
+        return 4 * math.ceil((self.dimensions * (self.stride + 5) + 2) / 4)
 
     @property
     def _matrix_floats(self) -> int:

@@ -146,7 +146,7 @@ class Rollout:
         episode: The episode that a robot runs: replica ``episode % replicas`` of terrain slot
             ``episode // replicas``, -1 for none; shape (num_envs,).
         outcome: :class:`kernels.episode.Outcome` of it, shape (num_envs,).
-        trail: How routes were commanded and walked (:mod:`kernels.route`); None of a bank without conditions.
+        trail: How routes were commanded and walked (:mod:`kernels.route`); None where all episodes are crossings.
         watch: Looks at these arrays before every control step (it is called with False), where a robot that has just
             taken an episode stands at its start, and after it (True), before robots take the next.
     """
@@ -185,13 +185,14 @@ class Rollout:
         self.num_envs = min(num_envs or num_terrains * replicas, num_terrains * replicas)
         self.space = space
         self.watch: Callable[[bool], None] | None = None
+        asked = with_conditions or space.asks != Kind.CROSS  # whether episodes may be no crossings
         with_ground |= bool(space.ground)
         with_conditions |= space.has_conditions
         prepare_torch(device)
         loaded = load_policy(policy, robot, device) if isinstance(policy, str | Path) else policy
         try:
             bank = TerrainBank(num_terrains, device=device, with_ground=with_ground, with_conditions=with_conditions)
-            self._build(bank, loaded, solver, steered=with_steering)
+            self._build(bank, loaded, solver, asked=asked, steered=with_steering)
         except (MemoryError, RuntimeError) as error:  # those of Warp have no type of their own
             failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
             if not failed and not str(error).startswith("Failed to allocate"):
@@ -200,7 +201,9 @@ class Rollout:
             got = f"{self.num_envs:,} robots and {num_terrains:,} terrains at once"
             raise ValueError(f"{rule}, got {got}: give fewer") from error
 
-    def _build(self, bank: TerrainBank, policy: Policy, solver: SolverCfg | None, *, steered: bool) -> None:
+    def _build(
+        self, bank: TerrainBank, policy: Policy, solver: SolverCfg | None, *, asked: bool, steered: bool
+    ) -> None:
         from sim.simulation import Reward, Simulation  # Newton takes seconds to load: only what simulates loads it
 
         robot = self.robot
@@ -243,7 +246,7 @@ class Rollout:
                 self._reward = Reward(sim, robot.training, self._robot_step, falls=(Outcome.BASE_COLLISION,))
                 self._stepped = make_episodes(num_envs)
                 self._latches.append((make_task(self.cfg, robot, to_goal=False), self._stepped))
-            self.trail = make_trail(num_envs, robot, bank.device) if bank.conditions is not None else None
+            self.trail = make_trail(num_envs, robot, bank.device) if asked else None
             self._rewards = Rewards() if self._reward is None else self._reward.state
             self._policy = PolicyRunner(policy, self._observation, self._action, self._queue.begins)
             self._step_graph = sim.capture(self._launch_control_step)

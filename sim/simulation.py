@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels.actuator_net import make_torques
-from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_drive, make_force
+from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_drive, make_force, make_meet
 from kernels.contact import collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
 from kernels.episode import Episodes, Outcome
@@ -270,9 +270,8 @@ class Simulation:
         former = (self.num_envs, 1 + math.ceil(MAX_LATENCY_S / robot.control_dt), robot.observation_size)
         poses = (self.num_envs, 1 + 2 * math.ceil(MAX_MAP_DELAY_S / robot.control_dt))
         maps = {"map_pose": poses, "map_drift": (self.num_envs, 2), "held": (self.num_envs, len(self.sensors.scan_x))}
-        self.disturbed = make_zeros(
-            Disturbed, self.device, row=rows, former=former, steps=self.num_envs, is_misled=self.num_envs, **maps
-        )
+        of_each = dict.fromkeys(("steps", "is_misled", "map_view"), self.num_envs)
+        self.disturbed = make_zeros(Disturbed, self.device, row=rows, former=former, **of_each, **maps)
         drives |= {"friction": self.bank.ground.factor, "is_misled": self.disturbed.is_misled}
         self._varied = self.dynamics.vary_bases(**drives, physics_dt=robot.physics_dt)
         self.disturbed.noise = self.make_noise(NoiseCfg())
@@ -329,7 +328,9 @@ class Simulation:
             values = {"dt": dt, "every": round(self.robot.control_dt / dt), "decimation": self.robot.decimation}
             values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
             values["terrain"] = self.bank.terrain
-            make_disturb(condition_effects("disturb"))(make_struct(DisturbedStep, self, **values))
+            step = make_struct(DisturbedStep, self, **values)
+            make_meet(condition_effects("meet"))(step)
+            make_disturb(condition_effects("disturb"))(step)
 
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""

@@ -187,7 +187,7 @@ def observed_motion(sim: Simulation, segments: list[Segment], asks: Kind = Kind.
 
     def beside() -> None:
         sim.begin_conditions(nobody)
-        if disturbed is not None:
+        if disturbed is not None and asks == Kind.ROUTE:
             follow_routes(sim.joint_q, disturbed.row, task, robot.control_dt, episodes, trail, command)
         sim.observe(step, episodes, robot.physics_dt, None, counter, observation)
 

@@ -32,9 +32,11 @@ _print_once = functools.cache(print)
 def prepare_torch(device: str) -> None:
     """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting.
 
-    On the CPU, torch gets one thread, as Warp has: batches are small, and a second thread only waits on a busy core.
+    On the CPU, torch gets one thread, as Warp has: batches are small, and a second thread only waits on a busy core. On
+    CUDA it takes algorithms that repeat.
     """
     if device.startswith("cuda"):
+        torch.backends.cudnn.deterministic = True
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
     else:
         torch.set_num_threads(1)

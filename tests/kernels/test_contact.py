@@ -196,7 +196,7 @@ def test_a_state_that_is_not_finite_touches_nothing_nor_does_a_parked_robot():
 def test_contact_forces_of_one_geom_add_up_and_others_are_left_out(count, column_of_shape, expected):
     # Two robots with room for two contacts; contact k is on shape k of robot k % 2, with 10 k + (1, 2, 3) N.
     force = [[(1, 2, 3), (21, 22, 23)], [(11, 12, 13), (31, 32, 33)]]
-    contacts = filled(Contacts, count=count, shape=[[0, 2], [1, 3]], force=np.float32(force))
+    contacts = filled(Contacts, count=count, rank=[[4, 1], [2, 3]], shape=[[0, 2], [1, 3]], force=np.float32(force))
     out = wp.full((2, 4), wp.vec3(7.0), dtype=wp.vec3)
     sum_forces(contacts, wp.array(column_of_shape, dtype=int), out)
     forces = out.numpy()

@@ -205,6 +205,36 @@ def test_every_kind_of_constraint(device, arms, height):
     assert dims == {1, 3, 4, 6}
 
 
+def test_the_order_in_which_contacts_were_found_changes_no_bit(device):
+    """Sums over contacts follow their ranks, wherever they lie, in shared memory and beyond."""
+    m, d, contacts = everything(device, 31, -0.2)
+    ours, rng, before, results = make_ours(m, d, contacts), np.random.default_rng(4), read_state(d), []
+    with wp.ScopedDevice(device):
+        mjw.step(m, d)
+        copy_contacts(d, contacts)
+        count, columns = contacts.count.numpy(), ("shape", "point", "normal", "distance")
+        found = {name: getattr(contacts, name).numpy().copy() for name in columns}
+        rows = np.arange(WORLDS)[:, None]
+        for turn in range(3):
+            order = np.tile(np.arange(CAPACITY), (WORLDS, 1))
+            if turn:
+                for row, number in zip(order, count, strict=True):
+                    rng.shuffle(row[:number])
+            contacts.rank.assign(10 * order)
+            for name, values in found.items():
+                getattr(contacts, name).assign(values[rows, order])
+            restore(d, before)
+            ours.find()
+            ours.step()
+            forces = np.zeros((WORLDS, CAPACITY, 3), np.float32)
+            forces[rows, order] = contacts.force.numpy()
+            results.append([*read_state(d), *(force[:number] for force, number in zip(forces, count, strict=True))])
+    assert count.max() > 8
+    for result in results[1:]:
+        for array, first in zip(result, results[0], strict=True):
+            np.testing.assert_array_equal(array, first)
+
+
 def test_robots_that_fall(eight, monkeypatch):
     """Steps of the robots that searches cross with, in all states of their contacts, against mujoco_warp's.
 

@@ -8,8 +8,8 @@ from sim.terrains.quantities import Sweep
 
 
 @wp.func
-def _blow(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
-    if column == 0 and row[first] != 0.0:
+def _blow(step: DisturbedStep, row: wp.array[float], first: int, env: int):
+    if row[first] != 0.0:
         step.joint_qd[env, 0] += row[first] * float(step.every) * step.dt
 
 
@@ -18,7 +18,7 @@ class Wind(Condition):
     genes = (Gene(name="wind", low=-5.0, middle=0.0, high=5.0, unit="m/s^2"),)
     form, least = "wind of {:.1f} m/s^2", 0.05
     dose = Sweep("wind", (0.0, 1.0, 2.0), title="wind from behind")
-    disturb = _blow
+    meet = _blow
 
     def disturb_plain(self, episodes, values, rows, running, step):
         for k in running:

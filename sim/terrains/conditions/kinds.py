@@ -66,8 +66,10 @@ class Condition:
     """Limits between which its first value is drawn for varied conditions; None if it stays nominal."""
     begin: ClassVar[Any] = None
     """Warp function that varies a robot where its episode begins (:mod:`kernels.conditions`)."""
+    meet: ClassVar[Any] = None
+    """Warp function of what meets a robot before a control step."""
     disturb: ClassVar[Any] = None
-    """Warp function that disturbs a control step."""
+    """Warp function that disturbs a column of an observation."""
     drive: ClassVar[Any] = None
     """Warp function that changes joint targets in a physics step."""
     force: ClassVar[Any] = None
@@ -163,7 +165,7 @@ def condition_texts(row: NDArray[np.floating], names: Sequence[str]) -> list[str
     return [texts[name] for name in names]
 
 
-def condition_effects(stage: Literal["begin", "disturb", "drive", "force"]) -> tuple[tuple[Any, int], ...]:
+def condition_effects(stage: Literal["begin", "meet", "disturb", "drive", "force"]) -> tuple[tuple[Any, int], ...]:
     """Warp functions of a stage in the order in which they act, each with its first column in a row."""
     columns = sorted(split_row(np.arange(len(nominal_row()))), key=lambda pair: pair[0].disturbs_last)
     return tuple((effect, int(own[0])) for condition, own in columns if (effect := getattr(condition, stage)))
@@ -382,8 +384,8 @@ class ObservationNoise(Condition):
 
 
 @wp.func
-def _disturb_push(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
-    if column == 0 and step.episodes.outcome[env] == Outcome.RUNNING:
+def _meet_push(step: DisturbedStep, row: wp.array[float], first: int, env: int):
+    if step.episodes.outcome[env] == Outcome.RUNNING:
         due = int(wp.round(row[first + 2] / step.dt))
         steps = step.episodes.steps[env]
         if steps <= due and due < steps + step.every:
@@ -402,7 +404,7 @@ class Push(Condition):
     )
     moment = "push_time"
     dose = Sweep("push_y", (0.0, 0.5, 1.0, 1.5, 2.0), {"push_time": 5.0}, "push to the side")
-    disturb = _disturb_push
+    meet = _meet_push
 
     def text(self, values: Array) -> str:
         """Its velocity and its time."""

@@ -1,9 +1,9 @@
 """Errors of what the controller sees: of the height map around the robot, and of its velocity.
 
 The height scan reads a map of the ground, whose errors act together: where there are any, the scan is left out of the
-observation, and :func:`_disturb_scan` adds what it shows under all of them. The first of the conditions has it, and
-reads the numbers of those that are registered behind it. What is drawn comes from the episode's own stream, in MuJoCo C
-too.
+observation. :func:`_meet_map` finds where it reads the map under all of them, and :func:`_disturb_scan` adds what it
+shows. The first of the conditions has both, and reads the numbers of those that are registered behind it. What is drawn
+comes from the episode's own stream, in MuJoCo C too.
 """
 
 from typing import Any, ClassVar
@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from kernels.conditions import DisturbedStep, VariedRobots, age_of
+from kernels.conditions import DisturbedStep, MapView, VariedRobots, age_of
 from kernels.heightfield import height_at
 from kernels.observation import LIN_VEL_SCALE, NUM_BASE_COLUMNS, SCAN_OFFSET, SCAN_SCALE
 from kernels.state import base_heading
@@ -34,17 +34,16 @@ def _draw(step: DisturbedStep, env: int, number: int) -> float:
 
 
 @wp.func
-def _drift(step: DisturbedStep, env: int, age: int, notes: bool) -> wp.spatial_vector:
-    """Random walk of the map up to a control step, straight in a second; whoever ``notes`` goes on with it."""
+def _drift(step: DisturbedStep, env: int, age: int) -> wp.spatial_vector:
+    """Random walk of the map up to a control step, straight in a second; it goes on."""
     walked = wp.spatial_vector()
     if age > 0:
         walked = step.memory.map_drift[env, age % 2]
-    if notes:
-        second = wp.max(1, int(wp.round(1.0 / (float(step.every) * step.dt))))
-        change = wp.spatial_vector()
-        for k in range(6):
-            change[k] = _draw(step, env, _A_SECOND * (age // second) + k) / float(second)
-        step.memory.map_drift[env, (age + 1) % 2] = walked + change
+    second = wp.max(1, int(wp.round(1.0 / (float(step.every) * step.dt))))
+    change = wp.spatial_vector()
+    for k in range(6):
+        change[k] = _draw(step, env, _A_SECOND * (age // second) + k) / float(second)
+    step.memory.map_drift[env, (age + 1) % 2] = walked + change
     return walked
 
 
@@ -57,42 +56,57 @@ def _begin_map(robots: VariedRobots, row: wp.array[float], first: int, terrain: 
 
 
 @wp.func
-def _disturb_scan(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
-    k = column - NUM_BASE_COLUMNS - 3 * step.sensors.default_joint_pos.shape[0]
-    if step.memory.is_misled[env] == 0 or k < 0 or k >= step.sensors.scan_x.shape[0]:
+def _meet_map(step: DisturbedStep, row: wp.array[float], first: int, env: int):
+    if step.memory.is_misled[env] == 0:
         return
     ahead, left, turn = row[first], row[first + 1], row[first + 2]
     drift, tilt = row[first + 3], row[first + 4]
     control_dt = float(step.every) * step.dt
     delay = int(wp.round(row[first + 5] / control_dt))
     period = wp.max(1, int(wp.round(row[first + 6] / control_dt)))
-    share, spacing, grain = row[first + 7], row[first + _SPACING], row[first + 9]
-    t = step.terrain_of_env[env]
     heading = base_heading(step.joint_q, env)
     x, y, z = step.joint_q[env, 0], step.joint_q[env, 1], step.joint_q[env, 2]
     seen = wp.spatial_vector(x, y, z, wp.atan2(heading[1], heading[0]), 0.0, 0.0)
     age, num_poses = age_of(step, env), step.memory.map_pose.shape[1]
     if drift != 0.0 or tilt != 0.0:
         sizes = wp.spatial_vector(drift, drift, drift, tilt, tilt, tilt)
-        seen -= wp.cw_mul(sizes, _drift(step, env, age, k == 0))
-    if k == 0:
-        step.memory.map_pose[env, age % num_poses] = seen
+        seen -= wp.cw_mul(sizes, _drift(step, env, age))
+    step.memory.map_pose[env, age % num_poses] = seen
     then = wp.max(age - delay, 0) // period * period
     if then < age:
         seen = step.memory.map_pose[env, then % num_poses]
-    shown_x, shown_y = step.sensors.scan_x[k], step.sensors.scan_y[k]
-    along, across = spacing * shown_x - ahead, spacing * shown_y - left
     c, s = wp.cos(seen[3] - turn), wp.sin(seen[3] - turn)
-    point_x, point_y = seen[0] + c * along - s * across, seen[1] + s * along + c * across
-    height = height_at(step.terrain, t, point_x, point_y)
+    view = MapView()
+    view.origin = wp.vec2(seen[0] - c * ahead + s * left, seen[1] - s * ahead - c * left)
+    view.axis = row[first + _SPACING] * wp.vec2(c, s)
+    view.height = seen[2]
+    view.tilt = wp.vec2(seen[4], seen[5])
+    step.memory.map_view[env] = view
+
+
+@wp.func
+def _disturb_scan(step: DisturbedStep, row: wp.array[float], first: int, env: int, column: int):
+    k = column - NUM_BASE_COLUMNS - 3 * step.sensors.default_joint_pos.shape[0]
+    if k < 0 or k >= step.sensors.scan_x.shape[0]:
+        return
+    if step.memory.is_misled[env] == 0:
+        return
+    share, grain = row[first + 7], row[first + 9]
+    t = step.terrain_of_env[env]
+    view = step.memory.map_view[env]
+    ahead, left = step.sensors.scan_x[k], step.sensors.scan_y[k]
+    x = view.origin[0] + view.axis[0] * ahead - view.axis[1] * left
+    y = view.origin[1] + view.axis[1] * ahead + view.axis[0] * left
+    height = height_at(step.terrain, t, x, y)
     if grain > 0.0:
         height = grain * wp.floor(height / grain + 0.5)
-    above = seen[2] + seen[4] * shown_x + seen[5] * shown_y - height
+    above = view.height + view.tilt[0] * ahead + view.tilt[1] * left - height
     if share > 0.0:
-        cell = int(wp.floor(point_y / HOLE_M)) * _CELLS + int(wp.floor(point_x / HOLE_M))
+        cell = int(wp.floor(y / HOLE_M)) * _CELLS + int(wp.floor(x / HOLE_M))
         is_missing = _draw(step, env, _OF_CELLS + cell) < 2.0 * share - 1.0
-        if is_missing and age == 0:
-            above = z - height_at(step.terrain, t, x, y)
+        if is_missing and step.memory.steps[env] == 0:
+            base = step.joint_q[env]
+            above = base[2] - height_at(step.terrain, t, base[0], base[1])
         elif is_missing:
             above = step.memory.held[env, k]
         step.memory.held[env, k] = above
@@ -183,6 +197,7 @@ class MapShift(Misperception):
     )
     dose = Sweep("shift_x", (0.0, 0.04, 0.08, 0.12, 0.16, 0.2), title="height map shifted ahead")
     begin = _begin_map
+    meet = _meet_map
     disturb = _disturb_scan
 
     def text(self, values: Array) -> str:
