@@ -101,6 +101,7 @@ def test_how_far_a_route_may_be_missed_is_measured_once(tmp_path, monkeypatch):
     ensure_stray(short, None, Compute("cpu"))
     measured = read_json(scales)["stray_m"]
     assert 0.02 < measured < 1.0 and read_stray(ROBOT) == measured
+    assert 0.02 < read_stray(ROBOT, resolved=True) < 1.0 and read_stray(ROBOT, resolved=True) != measured
     monkeypatch.setattr("qd.check.measure_stray", lambda *given: pytest.fail("it is measured again"))
     ensure_stray(short, None, Compute("cpu"))
 
