@@ -16,7 +16,6 @@ from typing import Any
 
 import warp as wp
 
-from kernels.coordinates import SolverState, read_pose
 from kernels.episode import Episodes
 from kernels.heightfield import Terrain
 from kernels.launch import kernel_over
@@ -237,20 +236,14 @@ def make_drive(effects: Effects) -> Callable[..., None]:
 
 @cache
 def make_force(effects: Effects) -> Callable[..., None]:
-    """What adds forces to those that the dynamics have found, before constraints are solved, and counts the steps.
+    """What adds forces to those that the dynamics have found, before constraints are solved, and counts the steps."""
 
-    It reads the poses of bodies too (:func:`kernels.coordinates.poses_from_solver`): a launch of its own would take as
-    long as all that the forces take.
-    """
-
-    @kernel_over("body_q_out", module="unique")
-    def force(step: ForcedStep, solver: SolverState, body_q_out: wp.array2d[wp.transform]):
-        """Grid (num_envs, bodies_per_env)."""
-        env, body = wp.tid()
-        read_pose(solver, env, body, body_q_out)
-        if body == 0:
-            for k in range(wp.static(len(effects))):
-                wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
-            step.memory.steps[env] += 1
+    @kernel_over("step.memory.steps", module="unique")
+    def force(step: ForcedStep):
+        """Grid (num_envs,)."""
+        env = wp.tid()
+        for k in range(wp.static(len(effects))):
+            wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
+        step.memory.steps[env] += 1
 
     return force

@@ -41,6 +41,17 @@ class Probes:
 
 
 @wp.struct
+class Poses:
+    """Poses of bodies, world-local frame; arrays of mujoco_warp's data, shape (num_envs, num_solver_bodies)."""
+
+    xpos: wp.array2d[wp.vec3]
+    xquat: wp.array2d[wp.quat]
+    """wxyz."""
+    column_of_body: wp.array[int]
+    """Column of each body of a robot, shape (bodies_per_env,); the base comes first."""
+
+
+@wp.struct
 class Contacts:
     """Terrain contacts of every robot, shape (num_envs, capacity) each."""
 
@@ -154,7 +165,7 @@ def _collide_strip(
 
 @wp.kernel
 def _collide_strips_kernel(
-    body_q: wp.array2d[wp.transform],
+    poses: Poses,
     terrain_of_env: wp.array[int],
     terrain: Terrain,
     probes: Probes,
@@ -167,7 +178,9 @@ def _collide_strips_kernel(
     if parked[env] == 2:
         return
     t = terrain_of_env[env]
-    pose = body_q[env, probes.bundle_body[bundle]]
+    column = poses.column_of_body[probes.bundle_body[bundle]]
+    wxyz = poses.xquat[env, column]
+    pose = wp.transform(poses.xpos[env, column], wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
     ball = probes.bundle_ball[bundle]
     middle = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
     lower = wp.vec2(middle[0] - ball[3], middle[1] - ball[3])
@@ -179,16 +192,16 @@ def _collide_strips_kernel(
 
 
 def collide_strips(
-    body_q: Any, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, parked: Any, contacts: Contacts
+    poses: Poses, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, parked: Any, contacts: Contacts
 ) -> None:
     """Find every robot's terrain contacts, all of ``contacts`` but the forces.
 
-    ``body_q`` are the poses in the world-local frame, shape (num_envs, bodies_per_env). Without arrays the ground is
-    the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
+    Without arrays the ground is the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
     """
     contacts.count.zero_()
-    inputs = [body_q, terrain_of_env, terrain, probes, ground, parked, contacts]
-    wp.launch(_collide_strips_kernel, (len(probes.bundle_body), len(body_q)), inputs, device=body_q.device)
+    inputs = [poses, terrain_of_env, terrain, probes, ground, parked, contacts]
+    size = (len(probes.bundle_body), len(terrain_of_env))
+    wp.launch(_collide_strips_kernel, size, inputs, device=terrain_of_env.device)
 
 
 def make_contacts(num_envs: int, capacity: int) -> Contacts:

@@ -15,7 +15,7 @@ from kernels.state import base_ang_vel_b, base_rotation, velocity_beside
 
 @wp.struct
 class SolverState:
-    """Arrays of mujoco_warp's data, and the columns of joints, bodies and targets in them."""
+    """Arrays of mujoco_warp's data, and the columns of joints and targets in them."""
 
     qpos: wp.array2d[float]
     """Coordinates, shape (num_envs, 7 + num_joints)."""
@@ -23,16 +23,10 @@ class SolverState:
     """Velocities, shape (num_envs, 6 + num_joints)."""
     ctrl: wp.array2d[float]
     """Controls of the actuators, shape (num_envs, num_actuators)."""
-    xpos: wp.array2d[wp.vec3]
-    """Positions of bodies, world-local frame [m], shape (num_envs, num_solver_bodies)."""
-    xquat: wp.array2d[wp.quat]
-    """Their rotations, wxyz."""
     column_of_joint: wp.array[int]
     """Column of each joint in ``qpos``, shape (num_joints,); in ``qvel`` it is one less."""
     target_of_actuator: wp.array[int]
     """Column in the targets of each actuator, shape (num_actuators,); -1 for none."""
-    column_of_body: wp.array[int]
-    """Column of each body of a robot in ``xpos``, shape (bodies_per_env,); the base comes first."""
     base_com: wp.vec3
 
 
@@ -152,21 +146,6 @@ def from_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> Non
     """Read coordinates and velocities from mujoco_warp's data."""
     size = (len(joint_q_out), 1 + len(solver.column_of_joint))
     wp.launch(_from_solver_kernel, size, [solver, joint_q_out, joint_qd_out], device=joint_q_out.device)
-
-
-@wp.func
-def read_pose(solver: SolverState, env: int, body: int, body_q_out: wp.array2d[wp.transform]):
-    """Read the pose of a body, world-local frame, from mujoco_warp's data."""
-    column = solver.column_of_body[body]
-    turned = solver.xquat[env, column]  # wxyz
-    body_q_out[env, body] = wp.transform(solver.xpos[env, column], wp.quat(turned[1], turned[2], turned[3], turned[0]))
-
-
-@kernel_over("body_q_out")
-def poses_from_solver(solver: SolverState, body_q_out: wp.array2d[wp.transform]):
-    """Grid (num_envs, bodies_per_env): read the poses of bodies."""
-    env, body = wp.tid()
-    read_pose(solver, env, body, body_q_out)
 
 
 @wp.struct

@@ -13,8 +13,8 @@ import warp as wp
 
 from kernels.actuator_net import make_torques
 from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_drive, make_force, make_meet
-from kernels.contact import collide_strips, make_contacts, sum_forces
-from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, poses_from_solver, to_solver
+from kernels.contact import Poses, collide_strips, make_contacts, sum_forces
+from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, to_solver
 from kernels.episode import Episodes, Outcome
 from kernels.ground import Ground
 from kernels.launch import make_struct, make_zeros
@@ -69,8 +69,7 @@ class Simulation:
         overflow: mujoco_warp's overflow bits of the last step, shape (num_envs,).
         contacts: Terrain contacts of the last step.
         parked: 2 for robots that steps leave out, shape (num_envs,).
-        body_q: Body poses at the beginning of the last step, world-local frame, transforms of shape (num_envs,
-            bodies_per_env).
+        poses: Poses of bodies at the beginning of the last step.
         column_of_shape: Column in ``geom_force`` of each collision shape of a robot, -1 for none.
         geom_of_shape: The solver's number of each.
         base_com: Mass centre of the base in its frame [m].
@@ -195,7 +194,6 @@ class Simulation:
         robot = self.robot
         num_envs = self.num_envs
         self._state = self.model.state()
-        self.body_q = self._state.body_q.reshape((num_envs, -1))
         self.joint_q = self._state.joint_q.reshape((num_envs, -1))
         self.joint_qd = self._state.joint_qd.reshape((num_envs, -1))
         self.targets = wp.zeros(self.joint_q.shape, dtype=float)
@@ -222,9 +220,10 @@ class Simulation:
             solver.mjw_data,
             column_of_joint=wp.array(columns, dtype=int),
             target_of_actuator=wp.array(7 + np.array(joints, dtype=int), dtype=int),
-            column_of_body=wp.array(bodies[-self.body_q.shape[1] :], dtype=int),
             base_com=self.base_com,
         )
+        of_robot = bodies[len(bodies) - self.model.body_count // num_envs :]
+        self.poses = make_struct(Poses, solver.mjw_data, column_of_body=wp.array(of_robot, dtype=int))
         # Speed-dependent torque limits and a delay of targets, which ideal drives lack.
         self.motors = None
         if robot.saturation_effort is not None:
@@ -335,7 +334,7 @@ class Simulation:
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""
         terrain, ground = self.bank.terrain, self.bank.ground or Ground()
-        collide_strips(self.body_q, self.terrain_of_env, terrain, self.probes, ground, self.parked, self.contacts)
+        collide_strips(self.poses, self.terrain_of_env, terrain, self.probes, ground, self.parked, self.contacts)
 
     def physics_step(self) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
@@ -353,10 +352,8 @@ class Simulation:
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self.dynamics.find()
-            if self.disturbed is None:
-                poses_from_solver(coordinates, self.body_q)
-            else:
-                make_force(condition_effects("force"))(self._forced, coordinates, self.body_q)
+            if self.disturbed is not None:
+                make_force(condition_effects("force"))(self._forced)
             self.collide()
             self.dynamics.step()
             from_solver(coordinates, self.joint_q, self.joint_qd)

@@ -26,7 +26,6 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 from tests.bench import counterparts
 from tests.bench.ceiling import Work
-from tests.sim.scenes import refresh
 
 FLOAT = 4
 FLOPS_PER_TRIANGLE = 60  # six dot products, their differences, comparisons up to an edge (Ericson's nearest point)
@@ -58,8 +57,6 @@ def build_scene(robot: RobotCfg, device: str, *, num_envs: int, num_terrains: in
     sim = rollout.sim
     actions = np.random.default_rng(seed).normal(size=(num_envs, robot.num_joints)).astype(np.float32)
     with wp.ScopedDevice(device):
-        refresh(sim)
-        sim.collide()  # of the poses in which the last step ended
         command = wp.zeros((num_envs, 3), dtype=float)
         command_goal(sim.joint_q, wp.zeros(num_envs, dtype=int), make_task(rollout.cfg, robot), command)
         return Scene(rollout=rollout, genes=genes, command=command, last_action=wp.array(actions))
@@ -137,6 +134,13 @@ def _rasterise_case(scene: Scene) -> Case:
     )
 
 
+def _body_q(sim: Any) -> torch.Tensor:
+    """Poses at the beginning of the last step, (num_envs, num_bodies, 7), quaternions xyzw."""
+    columns = sim.poses.column_of_body.numpy()
+    turned = wp.to_torch(sim.poses.xquat)[:, columns]
+    return torch.cat([wp.to_torch(sim.poses.xpos)[:, columns], turned[..., 1:], turned[..., :1]], dim=-1)
+
+
 def _kernel_contacts(scene: Scene, tables: counterparts.ProbeTables) -> np.ndarray:
     """Contacts of the kernel by robot and probe, (num_envs, num_probes, 7), NaN where there is none.
 
@@ -149,7 +153,7 @@ def _kernel_contacts(scene: Scene, tables: counterparts.ProbeTables) -> np.ndarr
     env, slot = np.nonzero(np.arange(capacity) < count[:, None])
     names = ("shape", "point", "normal", "distance")
     shape, point, normal, distance = (getattr(sim.contacts, name).numpy()[env, slot] for name in names)
-    centres = counterparts.probe_centres(wp.to_torch(sim.body_q), tables).cpu().numpy()
+    centres = counterparts.probe_centres(_body_q(sim), tables).cpu().numpy()
     radius, distance = tables.radius.cpu().numpy(), distance[:, None]
     # The point is half way between the surfaces, from where a radius and half of the distance lead to the centre.
     found = point[:, None] + normal[:, None] * (0.5 * distance + radius)[..., None]
@@ -173,7 +177,7 @@ def _torch_contacts(outputs: tuple[torch.Tensor, ...], num_probes: int) -> np.nd
 
 def _contact_case(scene: Scene) -> Case:
     sim: Any = scene.rollout.sim
-    body_q = wp.to_torch(sim.body_q)
+    body_q = _body_q(sim)
     tables = counterparts.make_tables(sim.probes, SPACING, body_q.device)
     arguments = (body_q, wp.to_torch(sim.terrain_of_env), wp.to_torch(sim.bank.heights), SPACING, tables)
     num_probes, poses = len(tables.position), 7 * len(tables.body.unique())

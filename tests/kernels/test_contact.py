@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.contact import Contacts, Probes, collide_strips, make_contacts, sum_forces
+from kernels.contact import Contacts, Poses, Probes, collide_strips, make_contacts, sum_forces
 from kernels.ground import FIRM, PATCHES, Ground, make_ground
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
 from sim.mujoco_c.model import surface_heights
@@ -48,7 +48,11 @@ def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundl
     buffer = make_contacts(len(poses), room or 3 * len(strips))
     buffer.count.fill_(5)  # of another step
     buffer.shape.fill_(UNTOUCHED)
-    world, on = wp.array(poses, dtype=wp.transform), wp.array(terrain_of_env, dtype=int)
+    # In the solver's arrays the world comes first, bodies in the opposite order, and w first in quaternions.
+    columns, wxyz = np.arange(len(strips), 0, -1), poses[..., [6, 3, 4, 5]]
+    xpos, xquat = np.full((len(poses), 1 + len(strips), 3), np.nan), np.full((len(poses), 1 + len(strips), 4), np.nan)
+    xpos[:, columns], xquat[:, columns] = poses[..., :3], wxyz
+    world, on = filled(Poses, xpos=xpos, xquat=xquat, column_of_body=columns), wp.array(terrain_of_env, dtype=int)
     parked, probes = wp.array(np.full(len(poses), parked), dtype=int), make_probes(strips, spread, bundled)
     collide_strips(world, on, make_terrain(grids), probes, ground or Ground(), parked, buffer)
     count = buffer.count.numpy()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.coordinates import Delay, SolverState, from_solver, poses_from_solver, to_solver
+from kernels.coordinates import Delay, SolverState, from_solver, to_solver
 from kernels.observation import Sensors, apply_action, write_observation
 from kernels.state import RobotStep
 from sim.mujoco_c.model import Starts, observations
@@ -69,19 +69,18 @@ def test_action_by_hand():
     assert (targets[:, :7] == 9).all()  # the base's columns are not targets
 
 
-# In mujoco_warp's data joints and bodies are in another order.
+# In mujoco_warp's data joints are in another order.
 ENVS = 5
-COLUMNS, FOLLOWED, BODIES = (9, 7, 8), (8, -1, 7, 9), (2, 1)
+COLUMNS, FOLLOWED = (9, 7, 8), (8, -1, 7, 9)
 
 
 @pytest.fixture
 def solver():
-    """The data of five robots with three joints, four actuators and two bodies, all of it -5."""
+    """The data of five robots with three joints and four actuators, all of it -5."""
     return filled(
         SolverState,
         **{name: np.full((ENVS, width), -5.0) for name, width in (("qpos", 10), ("qvel", 9), ("ctrl", 4))},
-        **{"xpos": np.zeros((ENVS, 3, 3)), "xquat": np.zeros((ENVS, 3, 4)), "base_com": BASE_COM},
-        **{"column_of_joint": COLUMNS, "target_of_actuator": FOLLOWED, "column_of_body": BODIES},
+        **{"base_com": BASE_COM, "column_of_joint": COLUMNS, "target_of_actuator": FOLLOWED},
     )
 
 
@@ -115,14 +114,3 @@ def test_state_is_read_back(solver, written):
     from_solver(solver, *now)
     np.testing.assert_array_equal(now[0].numpy(), q)
     np.testing.assert_allclose(now[1].numpy(), qd, atol=3e-6)
-
-
-def test_poses_are_those_of_the_bodies_with_quaternions_turned_round(solver):
-    rng = np.random.default_rng(1)
-    positions, rotations = rng.normal(size=(ENVS, 3, 3)), rng.normal(size=(ENVS, 3, 4))
-    solver.xpos.assign(np.float32(positions))
-    solver.xquat.assign(np.float32(rotations))
-    poses = wp.zeros((ENVS, 2), dtype=wp.transform)
-    poses_from_solver(solver, poses)
-    expected = np.concatenate([positions, rotations[..., [1, 2, 3, 0]]], axis=-1)[:, list(BODIES)]
-    np.testing.assert_array_equal(poses.numpy(), np.float32(expected))

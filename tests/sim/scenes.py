@@ -75,13 +75,14 @@ def put(sim: Simulation, joint_q: np.ndarray, joint_qd: np.ndarray | None = None
     sim.joint_qd.assign(np.zeros(sim.joint_qd.shape, np.float32) if joint_qd is None else np.float32(joint_qd))
     sim.targets.assign(np.float32(joint_q))
     sim.clear_solver(wp.ones(sim.num_envs, dtype=int, device=sim.device))
-    refresh(sim)
 
 
-def refresh(sim: Simulation) -> None:
-    """Compute body poses from the joint coordinates, for who reads them without a step."""
+def present(sim: Simulation, name: str) -> np.ndarray:
+    """``body_q`` or ``body_qd`` of Newton's state at the present coordinates, shape (num_envs, num_bodies, ...)."""
     state: Any = sim._state
     newton.eval_fk(sim.model, state.joint_q, state.joint_qd, state)
+    values = getattr(state, name).numpy()
+    return values.reshape(sim.num_envs, -1, values.shape[-1])
 
 
 class Stepper:

@@ -18,7 +18,7 @@ from sim.terrains.hand_crafted import CROSSING_TYPES, SPACING, crossing_terrain
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from tests.kernels import oracle
 from tests.sim import plain_mujoco, scenes
-from tests.sim.scenes import Stepper, free_body, lying, positions, put, refresh, simulate, slope, standing, velocities
+from tests.sim.scenes import Stepper, free_body, lying, positions, present, put, simulate, slope, standing, velocities
 
 DROPS = 40
 GRAVITY = 9.81
@@ -39,7 +39,7 @@ def above_ground(robot, grids, rng):
 def gaps(sim, grids):
     """Smallest gap between the surface and any probe of each robot (negative: inside) [m]."""
     probes = sim.probes
-    poses = sim.body_q.numpy()
+    poses = present(sim, "body_q")
     counts = np.diff(probes.strip_start.numpy())
     body = np.repeat(probes.bundle_body.numpy(), np.diff(probes.strip_start.numpy()[probes.bundle_start.numpy()]))
     radii = np.repeat(probes.strip_radius.numpy(), counts)
@@ -65,7 +65,6 @@ def test_fallen_robots_lie_on_the_surface_and_nothing_overflows(robot, device):
         assert np.isfinite(velocities(sim)).all()
 
     Stepper(sim).run(4.0, watch)
-    refresh(sim)
     settled = np.abs(velocities(sim)[:, :6]).max(axis=1) < 0.5
     # On the sphere of its pelvis Cassie rolls on where the ground leans, and on its way takes off now and then.
     assert settled.mean() > {"anymal": 0.85, "cassie": 0.25}[robot.name]
@@ -136,8 +135,7 @@ def test_contact_forces_are_what_changes_the_momentum(eight, robot):
     masses = np.array(eight.model.body_mass.numpy()).reshape(8, -1, 1)
 
     def momentum():
-        refresh(eight)
-        return (masses * np.array(eight._state.body_qd.numpy()).reshape(8, -1, 6)[:, :, :3]).sum(1)
+        return (masses * present(eight, "body_qd")[:, :, :3]).sum(1)
 
     before, impulse, duration_s = momentum(), np.zeros((8, 3)), 1.0
 
