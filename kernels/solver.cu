@@ -149,46 +149,87 @@ auto update_forces = [&]() {
     }
 };
 
-// Solves h x = y in place by L D L^T, column by column; h is overwritten. Each lane holds its rows. The pivot row goes through
-// shared memory: h is symmetric, so each lane writes one number of it.
+// Solves h x = y in place by L D L^T; h is overwritten. Each lane holds its rows. Pivot rows go through shared memory: h is
+// symmetric, so each lane writes one number of each. Loops of a warp need constant bounds to be unrolled, and take two columns at
+// once: a warp waits for its memory half as often. Nobody reads finished numbers of a row again, but those right of its pivot.
 auto solve = [&](LaneRows& h, LaneVector& y) {
-    // One thread skips finished rows, and changes finished numbers of a row with the others: nobody reads them again. Loops of
-    // a warp need constant bounds to be unrolled.
-    constexpr bool ONE = LANES == 1;
     float inverse[PER_LANE];
-    #pragma unroll ALL
-    for (int k = 0; k < NV; ++k) {
-        float* row = part + k % 2 * LD;  // two rows in turn: slow lanes may still read the other
-        #pragma unroll ALL
-        for (int m = ONE ? k : 0; m < PER_LANE; ++m) {
-            if (lane + m * LANES < NV) row[lane + m * LANES] = h[m][k];
+    if (LANES == 1) {
+        for (int k = 0; k < NV; ++k) {
+            float* row = part + k % 2 * LD;
+            for (int i = k; i < NV; ++i) row[i] = h[i][k];
+            inverse[k] = 1.0f / row[k];
+            for (int i = k + 1; i < NV; ++i) {
+                const float below = h[i][k] * inverse[k];
+                y[i] -= below * y[k];
+                for (int j = k / 4 * 4; j < NV; j += 4) {
+                    if (j + 3 <= k) continue;
+                    const Float4 four = *(const Float4*)(row + j);
+                    for (int n = 0; n < 4; ++n) h[i][j + n] -= below * four.v[n];
+                }
+            }
+        }
+        for (int k = NV - 1; k >= 0; --k) {
+            y[k] *= inverse[k];
+            for (int i = 0; i < k; ++i) y[i] -= h[i][k] * y[k];
+        }
+        return;
+    }
+    #pragma unroll
+    for (int k = 0; k < NV - 1; k += 2) {
+        float *row = part + k / 2 % 2 * 2 * LD, *next = row + LD;  // two pairs in turn: slow lanes may still read the other
+        #pragma unroll
+        for (int m = 0; m < PER_LANE; ++m) {
+            if (lane + m * LANES < NV) {
+                row[lane + m * LANES] = h[m][k];
+                next[lane + m * LANES] = h[m][k + 1];
+            }
         }
         sync();
-        const float pivot = 1.0f / row[k], y_k = shuffle(y[k / LANES], k % LANES);
-        #pragma unroll ALL
-        for (int m = ONE ? k : 0; m < PER_LANE; ++m) {
+        const float beside = row[k + 1], pivot = 1.0f / row[k], share = beside * pivot;
+        const float next_pivot = 1.0f / (next[k + 1] - share * beside), y_k = shuffle(y[k / LANES], k % LANES);
+        const float y_next = shuffle(y[(k + 1) / LANES], (k + 1) % LANES) - share * y_k;
+        #pragma unroll
+        for (int m = 0; m < PER_LANE; ++m) {
             const int i = lane + m * LANES;
             if (i == k) inverse[m] = pivot;
+            if (i == k + 1) inverse[m] = next_pivot;
             const float below = i > k ? h[m][k] * pivot : 0.0f;
-            y[m] -= below * y_k;
-            #pragma unroll ALL
-            for (int j = ONE ? k / 4 * 4 : 0; j < NV; j += 4) {
-                if (j + 3 <= k) continue;
-                const Float4 four = *(const Float4*)(row + j);
+            const float below_next = i > k + 1 ? (h[m][k + 1] - below * beside) * next_pivot : 0.0f;
+            const float of_row = below - below_next * share;
+            y[m] -= below * y_k + below_next * y_next;
+            #pragma unroll
+            for (int j = 0; j < NV; j += 4) {
+                if (j + 3 <= k + 1) continue;
+                const Float4 four = *(const Float4*)(row + j), next_four = *(const Float4*)(next + j);
                 #pragma unroll
                 for (int n = 0; n < 4; ++n) {
-                    if (ONE || (j + n > k && j + n < NV)) h[m][j + n] -= below * four.v[n];
+                    if (j + n > k + 1 && j + n < NV) h[m][j + n] -= of_row * four.v[n] + below_next * next_four.v[n];
                 }
             }
         }
     }
-    #pragma unroll ALL
-    for (int k = NV - 1; k >= 0; --k) {
+    constexpr int LAST = NV - 1;
+    if (NV % 2 == 1) {
+        float x = 0.0f;
+        #pragma unroll
+        for (int m = 0; m < PER_LANE; ++m) {
+            if (lane + m * LANES == LAST) x = y[m] / h[m][LAST];
+        }
+        x = shuffle(x, LAST % LANES);
+        #pragma unroll
+        for (int m = 0; m < PER_LANE; ++m) y[m] = lane + m * LANES == LAST ? x : y[m] - h[m][LAST] * x;
+    }
+    #pragma unroll
+    for (int k = LAST - NV % 2; k > 0; k -= 2) {
         const float x = shuffle(y[k / LANES] * inverse[k / LANES], k % LANES);
-        #pragma unroll ALL
-        for (int m = 0; m < (ONE ? k + 1 : PER_LANE); ++m) {
+        const float above = shuffle(h[(k - 1) / LANES][k], (k - 1) % LANES), y_above = shuffle(y[(k - 1) / LANES], (k - 1) % LANES);
+        const float x_above = (y_above - above * x) * shuffle(inverse[(k - 1) / LANES], (k - 1) % LANES);
+        #pragma unroll
+        for (int m = 0; m < PER_LANE; ++m) {
             const int i = lane + m * LANES;
-            y[m] = i == k ? x : i < k ? y[m] - h[m][k] * x : y[m];
+            const float left = y[m] - h[m][k] * x - h[m][k - 1] * x_above;
+            y[m] = i == k ? x : i == k - 1 ? x_above : i < k ? left : y[m];
         }
     }
 };
