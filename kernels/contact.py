@@ -93,16 +93,13 @@ class Surfaces:
 
 @wp.func
 def _write_contact(
-    contacts: Contacts, first: int, nth: int, strip: int, probe: int, pose: wp.transform, terrain: Terrain,
-    ground: Ground, t: int, env: int, probes: Probes,
+    contacts: Contacts, slot: int, rank: int, strip: int, centre: wp.vec3, point: SurfacePoint, ground: Ground, t: int,
+    env: int, probes: Probes,
 ):  # fmt: skip
-    slot = first + nth
     if slot < contacts.shape.shape[1]:
         radius = probes.strip_radius[strip]
-        centre = wp.transform_point(pose, probes.position[probe])
-        point = nearest_surface_point(terrain, t, centre, radius)
         touched = centre - point.normal * point.distance
-        contacts.rank[env, slot] = 3 * strip + nth
+        contacts.rank[env, slot] = rank
         contacts.shape[env, slot] = probes.strip_shape[strip]
         contacts.point[env, slot] = 0.5 * (touched + centre - point.normal * radius)
         contacts.normal[env, slot] = point.normal
@@ -139,6 +136,7 @@ def _collide_strip(
     deepest = int(-1)
     depth = float(0.0)
     point = SurfacePoint()
+    of_deepest = SurfacePoint()
     for k in range(begin, end):
         centre = wp.transform_point(pose, probes.position[k])
         if centre[2] - radius < ceiling:
@@ -152,15 +150,18 @@ def _collide_strip(
             if radius - point.distance > depth:
                 depth = radius - point.distance
                 deepest = k
+                of_deepest = point
     if first < 0:
         return
     count = 1 + int(first != deepest) + int(last != deepest)
     slot = wp.atomic_add(contacts_out.count, env, count)
-    _write_contact(contacts_out, slot, 0, strip, deepest, pose, terrain, ground, t, env, probes)
-    if first != deepest:
-        _write_contact(contacts_out, slot, 1, strip, first, pose, terrain, ground, t, env, probes)
-    if last != deepest:
-        _write_contact(contacts_out, slot, count - 1, strip, last, pose, terrain, ground, t, env, probes)
+    for nth in range(count):
+        probe = wp.where(nth == 0, deepest, wp.where(nth == 1 and first != deepest, first, last))
+        centre = wp.transform_point(pose, probes.position[probe])
+        point = of_deepest
+        if nth > 0:
+            point = nearest_surface_point(terrain, t, centre, radius)
+        _write_contact(contacts_out, slot + nth, 3 * strip + nth, strip, centre, point, ground, t, env, probes)
 
 
 @wp.kernel
