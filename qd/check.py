@@ -190,8 +190,10 @@ def _half_label(dose: dict[str, Any], element: str) -> str:
     return f"of {bounds.get(half['beyond'], 'unknown height, since episodes are invalid')}"
 
 
-def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
+def find_fitting_height(crosser: Crosser, policy: str, *, room: int = 0) -> tuple[float, float]:
     """The largest height [m] at which a controller crosses 80 % of hard-random terrains, and the share at that height.
+
+    ``room`` is for terrains of a later call, as :meth:`qd.workers.crosser.Crosser.cross` has it.
 
     Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
     ground, fails everywhere on it, and a search says nothing. The least height is 2 cm.
@@ -200,7 +202,7 @@ def find_fitting_height(crosser: Crosser, policy: str) -> tuple[float, float]:
 
     def fails(height: float) -> bool:
         label = f"hard-random terrains of height {height:g} m"
-        result = crosser.cross(policy, _draw_terrains(_TRIED, height), replicas=1, label=label)
+        result = crosser.cross(policy, _draw_terrains(_TRIED, height), replicas=1, label=label, room=room)
         refuse_all_invalid(result)
         shares[height] = float(result.reached_goal[~result.invalid].mean())
         print(f"Height {height:g} m: {shares[height]:.0%} of episodes reach the goal.", flush=True)
@@ -231,7 +233,8 @@ def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, 
     prepare_output(out)
     results: list[RolloutResult] = []
     with Crosser(robot, compute, cache=RUNS / "crossings") as crosser:
-        height = None if robot.settings_file is None else find_fitting_height(crosser, policy)[0]
+        room = terrains if replicas == 1 else 0
+        height = None if robot.settings_file is None else find_fitting_height(crosser, policy, room=room)[0]
         drawn = _draw_terrains(_MAX_ROUNDS * terrains, height)
         for first in range(0, len(drawn), terrains):
             label = f"hard-random terrains from {first + 1:,}"

@@ -150,7 +150,7 @@ def test_terrain_is_as_high_as_the_controller_crosses_it_mostly(crossed_up_to, e
     heights = []
 
     class Crosses:
-        def cross(self, policy, terrains, *, replicas, label):
+        def cross(self, policy, terrains, *, replicas, label, room):
             heights.append(0.25 * np.abs(terrains.genes[:, 7]).max())  # of the first bump
             result = stand_in.evaluate(terrains.genes, terrains.seeds, replicas)
             return failing(0.0 if heights[-1] <= crossed_up_to + 1e-6 else 0.5)(result)
