@@ -219,17 +219,22 @@ def sum_forces(contacts: Contacts, column_of_shape: wp.array[int], geom_force_ou
     env, column = wp.tid()
     count = wp.min(contacts.count[env], contacts.shape.shape[1])
     force = wp.vec3(0.0)
-    added = int(-1)  # rank of the last contact
-    for _ in range(count):
-        following = int(-1)
-        least = int(2147483647)
-        for c in range(count):
-            rank = contacts.rank[env, c]
-            if rank > added and rank < least and column_of_shape[contacts.shape[env, c]] == column:
-                following = c
-                least = rank
-        if following < 0:
-            break
-        force += contacts.force[env, following]
-        added = least
+    touching = int(0)
+    for c in range(count):
+        if column_of_shape[contacts.shape[env, c]] == column:
+            force += contacts.force[env, c]
+            touching += 1
+    if touching > 2:  # the order of two changes nothing
+        force = wp.vec3(0.0)
+        added = int(-1)  # rank of the last contact
+        for _ in range(touching):
+            following = int(-1)
+            least = int(2147483647)
+            for c in range(count):
+                rank = contacts.rank[env, c]
+                if rank > added and rank < least and column_of_shape[contacts.shape[env, c]] == column:
+                    following = c
+                    least = rank
+            force += contacts.force[env, following]
+            added = least
     geom_force_out[env, column] = force

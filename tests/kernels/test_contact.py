@@ -207,6 +207,21 @@ def test_contact_forces_of_one_geom_add_up_and_others_are_left_out(count, column
     assert {index: tuple(forces[index]) for index in map(tuple, np.argwhere(forces.any(axis=2)))} == expected
 
 
+def test_contact_forces_add_up_in_one_order_wherever_they_lie():
+    # Each row has the same twelve contacts, of two shapes, in another order; numbers of which sums round differently.
+    rng = np.random.default_rng(3)
+    force, shape = np.float32(rng.normal(size=(12, 3)) * 10.0 ** rng.uniform(-4, 4, (12, 1))), rng.integers(2, size=12)
+    order = np.array([np.arange(12), *(rng.permutation(12) for _ in range(20))])
+    contacts = filled(Contacts, count=np.full(21, 12), rank=3 * order, shape=shape[order], force=force[order])
+    out = wp.zeros((21, 2), dtype=wp.vec3)
+    sum_forces(contacts, wp.array([0, 1], dtype=int), out)
+    for column, forces in enumerate(np.moveaxis(out.numpy(), 1, 0)):
+        np.testing.assert_array_equal(forces, np.broadcast_to(forces[0], forces.shape))
+        np.testing.assert_allclose(forces[0], force[shape == column].sum(axis=0), rtol=1e-4)
+    rows = force[shape == 0]
+    assert len({np.add.reduce(rng.permutation(rows)).tobytes() for _ in range(20)}) > 1  # else order did not matter
+
+
 @wp.kernel
 def _sample_kernel(terrain: Terrain, points: wp.array[wp.vec3], reach: float, nearest_out: wp.array[SurfacePoint]):
     k = wp.tid()
