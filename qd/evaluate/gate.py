@@ -11,7 +11,7 @@ import sys
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -32,6 +32,7 @@ from sim.controllers.spec import controller_identity, crosser_name
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
 from sim.files.settings import NonNegativeInt, from_builtins, read_toml
+from sim.files.templates import open_templates
 from sim.rates import MAX_INVALID_SHARE
 from sim.robots.find import resolve_robot
 from sim.robots.robot import RobotCfg
@@ -40,11 +41,11 @@ from sim.terrains.maps.terrain_files import ExportedTerrain, encode_terrain
 from sim.terrains.spaces.registry import load_space, space_at
 from sim.terrains.terrains import Terrains
 
-Error = Annotated[float, Meta(ge=1e-3, lt=0.5)]
-Margin = Annotated[float, Meta(ge=1e-3, lt=0.5)]
+Small = Annotated[float, Meta(ge=1e-3, lt=0.5)]
 Limit = Annotated[float, Meta(gt=0, lt=1)]
 Name = Annotated[str, Meta(max_length=80, pattern=r"^[^\x00-\x1f|<>&`]*$")]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
+_TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _SETS = ("hand_crafted", "hard_random")
 _SEED_KEY = 20261130  # with seed, check and round, the entropy of a round's episodes, and of nothing else
 _SAVED = 3  # terrains of a check
@@ -67,7 +68,7 @@ class CheckCfg:
     """How many: the first of a pack."""
     limit: Limit | None = None
     """Mean goal rate that is asked for; none if the check is of old against new alone."""
-    margin: Margin = 0.05
+    margin: Small = 0.05
     """A rate of limit - margin fails and one of limit + margin passes, but for the error. New may be worse than old by
     less than this."""
     rounds: Count = 40
@@ -84,7 +85,7 @@ class GateCfg:
     """A gate.toml."""
 
     check: tuple[CheckCfg, ...]
-    error: Error = 0.05
+    error: Small = 0.05
     """Chance of a wrong pass, and of a wrong fail, of each test that is clear."""
     seed: NonNegativeInt = 0
     """Draws terrains of sets, and all episodes."""
@@ -111,13 +112,6 @@ def read_gate(file: Path) -> GateCfg:
         if names.count(check.title) > 1:
             raise ValueError(f"{where}: names must differ, got {check.title} twice: give each a name")
     return cfg
-
-
-def draw_round(terrains: Terrains, seed: int, check: int, number: int) -> Terrains:
-    """The terrains with the seeds of a round's episodes."""
-    sequence = np.random.SeedSequence([_SEED_KEY, seed], spawn_key=(check, number))
-    count = len(terrains)
-    return Terrains(**{**vars(terrains), "seeds": sequence.generate_state(count).astype(np.uint32)})
 
 
 class CheckTerrains(NamedTuple):
@@ -166,7 +160,8 @@ def run_check(
     done, clear = 0, dict[str, int]()
     while done < check.rounds and len(clear) < len(tests):
         some = range(done, min(done + each, check.rounds))
-        lot = Terrains.join([draw_round(terrains, cfg.seed, number, k) for k in some])
+        draws = [np.random.SeedSequence([_SEED_KEY, cfg.seed], spawn_key=(number, k)) for k in some]
+        lot = Terrains.join([replace(terrains, seeds=draw.generate_state(count)) for draw in draws])
         reached, valid = dict[str, NDArray[np.bool_]](), dict[str, NDArray[np.bool_]]()
         for by, policy in policies.items():
             label = f"{name}, {by}, round {done + 1} of at most {check.rounds}"
@@ -175,20 +170,20 @@ def run_check(
             reached[by] = result.reached_goal.reshape(len(some), count) & valid[by]
             goals[by] += [reached[by].sum(axis=0), valid[by].sum(axis=0)]
         done = some.stop
-        both = np.logical_and.reduce([*valid.values()])
-        if isinstance(test := tests.get("rate"), RateTest) and "rate" not in clear:
-            test.add(int(reached["new"].sum()), int(valid["new"].sum()))
-        if isinstance(test := tests.get("paired"), PairedTest) and "paired" not in clear:
-            lost, won = (reached[a] & ~reached[b] & both for a, b in (("old", "new"), ("new", "old")))
-            test.add(int(lost.sum()), int(won.sum()), int(both.sum()))
-        clear |= {kind: done for kind, test in tests.items() if kind not in clear and test.passes is not None}
+        hits = {"rate": (reached["new"], valid["new"])}
+        if "old" in policies:
+            both = valid["old"] & valid["new"]
+            hits["paired"] = (reached["old"] & ~reached["new"] & both, reached["new"] & ~reached["old"] & both, both)
+        for kind, test in tests.items():
+            if kind not in clear:
+                test.add(*(int(hit.sum()) for hit in hits[kind]))
+                clear |= {kind: done} if test.passes is not None else {}
     episodes = done * count
     for by, (_, counted) in goals.items():
         if (invalid := episodes - int(counted.sum())) > MAX_INVALID_SHARE * episodes:
             rule = f"{name}: at most {MAX_INVALID_SHARE:.0%} of the episodes of {by} may be invalid"
-            raise ValueError(
-                f"{rule}, got {invalid} of {episodes}: `faultline check` says what is wrong with the robot"
-            )
+            got = f"{invalid} of {episodes}: `faultline check` says what is wrong with the robot"
+            raise ValueError(f"{rule}, got {got}")
     verdicts = {kind: (test.passes, "clear") if kind in clear else test.decide() for kind, test in tests.items()}
     reached_goal, counted = goals["new"]
     causes = np.array([str(entry["cause"] or "unclear") for entry in known])
@@ -287,45 +282,29 @@ def to_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, float]]:
 def to_junit(report: Mapping[str, Any]) -> bytes:
     """The report as JUnit XML: a test case a check."""
     rows = to_rows(report)
-    counts = {word: str(sum(verdict == word for _, verdict, _, _ in rows)) for word in ("fail", "skipped")}
-    about = {"name": "faultline", "tests": str(len(rows)), "errors": "0", "failures": counts["fail"]}
-    suite = ElementTree.Element("testsuite", about | {"skipped": counts["skipped"], "timestamp": report["date"]})
+    verdicts = [verdict for _, verdict, _, _ in rows]
+    counts = {"tests": len(rows), "errors": 0, "failures": verdicts.count("fail"), "skipped": verdicts.count("skipped")}
+    about = {"name": "faultline", **{name: str(count) for name, count in counts.items()}, "timestamp": report["date"]}
+    about["time"] = f"{sum(row[-1] for row in rows):.3f}"
+    suites = ElementTree.Element("testsuites")
+    suite = ElementTree.SubElement(suites, "testsuite", about)
     properties = ElementTree.SubElement(suite, "properties")
     for name in ("robot", "policy", "policy_sha256", "gate_sha256", "commit", "device", "seed"):
         ElementTree.SubElement(properties, "property", name=name, value=str(report[name]))
     for name, verdict, why, seconds in rows:
-        case = ElementTree.SubElement(
-            suite, "testcase", classname=f"faultline.{report['robot']}", name=name, time=f"{seconds:.3f}"
-        )
+        about = {"classname": f"faultline.{report['robot']}", "name": name, "time": f"{seconds:.3f}"}
+        case = ElementTree.SubElement(suite, "testcase", about)
         if verdict == "pass":
             ElementTree.SubElement(case, "system-out").text = why
         else:
             ElementTree.SubElement(case, "failure" if verdict == "fail" else "skipped", message=why)
-    suite.set("time", f"{sum(row[-1] for row in rows):.3f}")
-    suites = ElementTree.Element("testsuites")
-    suites.append(suite)
     return ElementTree.tostring(suites, encoding="utf-8", xml_declaration=True)
 
 
 def to_markdown(report: Mapping[str, Any]) -> str:
     """The report as a summary in Markdown, as a step of GitHub's shows it."""
-    lines = [f"### faultline: {report['robot']} {'passes' if report['passes'] else 'fails'}", ""]
-    lines += ["| check | verdict | why |", "|---|---|---|"]
-    lines += [f"| {name} | **{verdict}** | {why} |" for name, verdict, why, _ in to_rows(report)]
-    for check in report["checks"]:
-        low, high = check["goal_interval"]
-        rates = ", ".join(f"{by} {rate:.3f}" for by, rate in check["goal_rate"].items())
-        invalid = f", {check['invalid_episodes']} of them invalid and left out" if check["invalid_episodes"] else ""
-        of_all = f"over all {check['episodes']} episodes{invalid}"
-        of_pack = f" of {check['pack']}" * bool(check["pack"])
-        fails = f"{len(check['failing'])} of {check['terrains']} terrains{of_pack} failed"
-        fails += f" in {check['rounds']} episodes each"
-        fails += f"; it was trained on {check['trained_on']} of them" * bool(check["trained_on"])
-        lines += ["", f"**{check['name']}**: goal rate {rates} (new {low:.3f} to {high:.3f}, 95 %) {of_all}; {fails}."]
-    tests, chance = sum(len(check["tests"]) for check in report["checks"]), report["error"]
-    error = f"A clear test is wrong with a chance of at most {chance:.3g}, at the margin from the limit or beyond"
-    error += f"; one of these {tests} with at most {min(1.0, tests * chance):.3g}." if tests > 1 else "."
-    return "\n".join([*lines, "", error, ""])
+    tests = sum(len(check["tests"]) for check in report["checks"])
+    return _TEMPLATES.get_template("gate.md").render(report, rows=to_rows(report), tests=tests) + "\n"
 
 
 def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], folder: Path) -> None:
@@ -396,9 +375,8 @@ class GateProcess:
         out.unlink(missing_ok=True)  # of another gate
         self.out, self._log = out, out.with_suffix(".log")
         with self._log.open("wb") as log:
-            self._process = subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-            )  # Ctrl-C of the training leaves it
+            pipes: Any = {"stdout": log, "stderr": subprocess.STDOUT}
+            self._process = subprocess.Popen(command, **pipes, start_new_session=True)  # Ctrl-C does not reach it
 
     @property
     def ended(self) -> bool:

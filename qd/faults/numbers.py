@@ -33,6 +33,10 @@ TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _INVALID = OUTCOMES.index("invalid")
 MAX_FALSE_DISCOVERIES = 0.05
 """Largest expected share of luck among what is significant (Benjamini and Hochberg 1995)."""
+_COUNTS = (
+    "confirmed", "certified", "faults", "faults_panel", "faults_controllers", "faults_witness", "fault_families",
+    "fault_families_controllers", "strong", "faults_fdr",
+)  # fmt: skip
 _KINDS = {"searched": "", "resolved": " with contact resolved", "varied": " under varied conditions"}
 FURTHER_NUMBERS = ("witnesses", "crossed_varied", "robust", "faults_mujoco_c", "likeliest")
 """Numbers of faults that an archive has only if they were crossed again, or its space has conditions."""
@@ -85,61 +89,54 @@ def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
 
 def fault_numbers(archive: Archive) -> dict[str, Any]:
     """The numbers of faults, as ``archive.json`` has them; None where nobody knows."""
-    failing, families = archive.failing, archive.family
-    names = archive.certifiers
-    parts = ("faults", "faults_panel", "faults_controllers", "faults_witness")
-    kinds = ("fault_families", "fault_families_controllers")
-    counts = ("confirmed", "certified", *parts, *kinds, "strong", "faults_fdr")
+    failing, names, witnesses = archive.failing, archive.certifiers, archive.witnesses
+
+    def count_families(rows: NDArray[np.bool_]) -> int | None:
+        return None if archive.family is None else len(np.unique(archive.family[rows]))
+
     numbers: dict[str, Any] = {
         "failing": None if archive.fresh is None else int(failing.sum()),
-        **dict.fromkeys(counts, 0 if archive.fresh is not None and not failing.any() else None),
-        "families": None if families is None else len(np.unique(families)),
-        "failing_families": None if families is None else len(np.unique(families[failing])),
+        **dict.fromkeys(_COUNTS, 0 if archive.fresh is not None and not failing.any() else None),
+        "families": count_families(np.ones(len(archive), bool)),
+        "failing_families": count_families(failing),
         "certifiers": list(names),
     }
     if not archive.is_judged or not failing.any():
         return numbers
     resolved = failing & archive.resolved_outcomes.any(axis=1)
     certificates = archive.certificates & failing[:, None]
-    numbers["crossed_resolved"] = int(resolved.sum())
-    numbers["certificates"] = [
-        {
-            "controller": name,
-            "policy_sha256": digest,
-            "crossed": int((archive.certifier_outcomes[:, column].any(axis=1) & failing).sum()),
-            "certified": int(certificates[:, column].sum()),
-        }
-        for column, (name, digest) in enumerate(zip(names, archive.certifier_sha256, strict=True))
-    ]
+    counts = {"crossed_resolved": resolved}
     if resolved.any():
-        numbers["confirmed"] = int(archive.confirmed.sum())
-    if (witnesses := archive.witnesses) is not None:
+        counts["confirmed"] = archive.confirmed
+    crossed = archive.certifier_outcomes.any(axis=2) & failing[:, None]
+    columns = (names, archive.certifier_sha256, crossed.sum(axis=0).tolist(), certificates.sum(axis=0).tolist())
+    keys = ("controller", "policy_sha256", "crossed", "certified")
+    numbers["certificates"] = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+    if witnesses is not None:
         tried = witnesses.walker != ""
         found = {name: int((witnesses.kind == kind).sum()) for kind, name in enumerate(WITNESSES) if name}
         own = int((witnesses.on_line & (witnesses.walker == SEARCHED)).sum())
         numbers["witnesses"] = {"tried": int(tried.sum()), **found, "own_line": own, "limit_m": witnesses.limit_m}
     if names or witnesses is not None:
-        numbers["certified"] = int(archive.certified.sum())
+        counts["certified"] = archive.certified
     if (names or witnesses is not None) and resolved.any():
         in_panel = np.array(names, np.str_) != SPECIALIST
         is_fault, by_controllers = archive.is_fault, archive.certified_by_controllers
-        numbers["faults"] = None if in_panel.all() and witnesses is None else int(is_fault.sum())
-        numbers["faults_panel"] = int((is_fault & certificates[:, in_panel].any(axis=1)).sum())
-        numbers["faults_controllers"] = int((is_fault & by_controllers).sum())
-        numbers["faults_witness"] = None if witnesses is None else int((is_fault & ~by_controllers).sum())
-        numbers["strong"] = int(archive.strong.sum())
-        numbers["faults_fdr"] = int((is_fault & find_significant(archive)).sum())
-        if families is not None:
-            numbers["fault_families"] = len(np.unique(families[is_fault]))
-            numbers["fault_families_controllers"] = len(np.unique(families[is_fault & by_controllers]))
+        counts |= {} if in_panel.all() and witnesses is None else {"faults": is_fault}
+        counts |= {} if witnesses is None else {"faults_witness": is_fault & ~by_controllers}
+        counts["faults_panel"] = is_fault & certificates[:, in_panel].any(axis=1)
+        counts["faults_controllers"] = is_fault & by_controllers
+        counts |= {"strong": archive.strong, "faults_fdr": is_fault & find_significant(archive)}
+        numbers["fault_families"] = count_families(is_fault)
+        numbers["fault_families_controllers"] = count_families(is_fault & by_controllers)
         if archive.varied is not None:
-            numbers["crossed_varied"] = int((is_fault & archive.varied.searched.any(axis=1)).sum())
-            numbers["robust"] = int(archive.robust.sum())
+            counts["crossed_varied"] = is_fault & archive.varied.searched.any(axis=1)
+            counts["robust"] = archive.robust
         if archive.mujoco_c is not None:
             tried = is_fault & archive.mujoco_c.searched.any(axis=1)
-            numbers["faults_mujoco_c"] = _share_held(archive, tried)
-            numbers["faults_mujoco_c"]["strong"] = _share_held(archive, tried & archive.strong)
-    return numbers
+            strong = _share_held(archive, tried & archive.strong)
+            numbers["faults_mujoco_c"] = _share_held(archive, tried) | {"strong": strong}
+    return numbers | {name: int(mask.sum()) for name, mask in counts.items()}
 
 
 def find_significant(archive: Archive) -> NDArray[np.bool_]:
@@ -315,8 +312,7 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
     try:
         numbers = read_json(file)
         arrays = read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
-        entries = numbers["elites"]
-        genes = arrays["genes"]
+        entries, genes = numbers["elites"], arrays["genes"]
         shape = (len(entries), archive.genes.shape[1])
         if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or genes.shape != shape:
             raise ValueError(f"{MINIMAL_NUMBERS_FILE} and {MINIMAL_FILE} are not of one another")
@@ -327,9 +323,8 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
         what = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"{rule}: {what}: remove both, or run `faultline minimise` again") from None
     # A search that went on may have found others of these numbers.
-    names = list(zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True))
-    rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]
-    if not rows:
-        return None
-    genes_by_elite = {entries[row]["elite"]: genes[row] for row in rows}
-    return MinimalTerrains(numbers=numbers | {"elites": [entries[row] for row in rows]}, genes=genes_by_elite)
+    names = {*zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True)}
+    named = [(entry["elite"], entry["cell"], entry["iteration"]) in names for entry in entries]
+    numbers["elites"] = [*compress(entries, named)]
+    genes_by_elite = {entry["elite"]: row for entry, row in zip(numbers["elites"], genes[named], strict=True)}
+    return MinimalTerrains(numbers=numbers, genes=genes_by_elite) if any(named) else None
