@@ -44,10 +44,9 @@ def fill_sizes(
     compute: Compute, terrains: int | None, episodes: int | None, *, full: tuple[int, int], small: tuple[int, int]
 ) -> tuple[int, int]:
     """Terrains and episodes a terrain: where they are None, ``full`` on a GPU, else ``small``, which it prints."""
-    on_gpu = compute.device.startswith("cuda")
-    if not on_gpu and terrains is None and episodes is None:
+    if not compute.on_gpu and terrains is None and episodes is None:
         print(f"No GPU: {small[0]} terrains x {small[1]} episodes each instead of {full[0]} x {full[1]}.")
-    default_terrains, default_episodes = full if on_gpu else small
+    default_terrains, default_episodes = full if compute.on_gpu else small
     return terrains or default_terrains, episodes or default_episodes
 
 
@@ -183,25 +182,16 @@ def _describe_archive(path: Path, archive: Archive) -> dict[str, Any]:
 
 
 def evaluate_rates(
-    robot: RobotCfg,
-    policy: str,
-    *,
-    compute: Compute,
-    terrains: int | None = None,
-    episodes: int | None = None,
-    space: str | None = None,
-    seed: int = 0,
-    out: Path | None = None,
+    robot: RobotCfg, policy: str, cfg: SetsCfg, *, compute: Compute, out: Path | None = None
 ) -> dict[str, Any]:
     """Rates of one controller on hand-crafted and hard-random terrains and its velocity error on flat ground.
 
-    Without ``terrains`` (a set) and ``episodes`` (a terrain) there are as many as suit the device; without ``out`` the
-    file lies under runs/. Returns what ``base.json`` has.
+    Without ``out`` the file lies under runs/. Returns what ``base.json`` has.
     """
-    count, episodes = fill_sizes(compute, terrains, episodes, full=(300, EPISODES), small=_SMALL)
+    count, episodes = fill_sizes(compute, cfg.terrains, cfg.episodes, full=(300, EPISODES), small=_SMALL)
     check_policy(policy, robot, compute.device)
-    terrain_space = space_at(load_space(space), None, robot)
-    sets = {name: plain_set(name, count, seed, terrain_space) for name in ("hand_crafted", "hard_random", "flat")}
+    space, seed = space_at(load_space(cfg.space), None, robot), cfg.seed
+    sets = {name: plain_set(name, count, seed, space) for name in ("hand_crafted", "hard_random", "flat")}
     controller = crosser_name(robot, policy)
 
     def make_report() -> dict[str, Any]:
@@ -213,7 +203,7 @@ def evaluate_rates(
         return {
             **compute.origin(seed),
             **controller_identity(robot, policy),
-            "space": terrain_space.name,
+            "space": space.name,
             "hand_crafted": summarise_crossings(hand_crafted, seed, types=types, levels=levels),
             "hard_random": summarise_crossings(hard_random, seed),
             "flat": velocity_error(flat, seed),

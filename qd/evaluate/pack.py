@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
-from qd.evaluate.labels import MEASURES, RATES
+from qd.evaluate.labels import MEASURES, RATES, SetsCfg
 from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
 from qd.evaluate.sets import TerrainSet, draw_seeds, hash_elites, read_trained_on, set_rng
 from qd.evaluate.tables import rate_cells, show_table
@@ -46,7 +46,6 @@ HEIGHT_UNIT_M = 1e-3
 """Heights of a pack are whole numbers of it, in its file and where they are crossed [m]."""
 NEAR_GOAL_RATE = 0.75
 """Goal rate of the searched controller from which on a terrain is no near-fault."""
-_GROUPS = ("verdict", "cause", "kind")
 _MAX_BYTES = 1e9  # of an array that is read
 _KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
 
@@ -69,8 +68,8 @@ class Pack:
     @property
     def name(self) -> str:
         """What a published one is asked for by, ``anymal@1``, or its folder."""
-        published = self.folder.parent == ROBOTS[robot].packs if (robot := self.content["robot"]) in ROBOTS else False
-        return f"{robot}@{self.folder.name}" if published else self.folder.name
+        robot, folder = self.content["robot"], self.folder
+        return f"{robot}@" * (robot in ROBOTS and folder.parent == ROBOTS[robot].packs) + folder.name
 
     @property
     def terrains(self) -> list[Entry]:
@@ -122,8 +121,8 @@ def write_terrains(folder: Path, heights: NDArray[np.float32], genes: NDArray[np
     units = np.rint(heights.astype(np.float64) / HEIGHT_UNIT_M).astype(np.int32)
     # Of smooth ground the rise along x hardly changes along y, so that this packs into a third of the bytes.
     twists = np.diff(np.diff(units, axis=2, prepend=np.int32(0)), axis=1, prepend=np.int32(0))
-    content = {"twists": twists, "height_unit_m": np.array(HEIGHT_UNIT_M), "genes": genes}
-    data = npz_bytes(content, compression=zipfile.ZIP_BZIP2)
+    arrays = {"twists": twists, "height_unit_m": np.array(HEIGHT_UNIT_M), "genes": genes}
+    data = npz_bytes(arrays, compression=zipfile.ZIP_BZIP2)
     write_atomically(folder / TERRAINS_FILE, data)
     return hashlib.sha256(data).hexdigest()
 
@@ -135,30 +134,22 @@ def round_heights(heights: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
     """The first ``count`` terrains of a pack; ``seed`` draws their episodes."""
-    seeds = draw_seeds(set_rng("pack", seed), len(heights))
-    return TerrainSet(terrains=Terrains(heights=heights[:count], seeds=seeds[:count]), numbers=np.arange(count))
+    seeds = draw_seeds(set_rng("pack", seed), len(heights))[:count]
+    return TerrainSet(terrains=Terrains(heights=heights[:count], seeds=seeds), numbers=np.arange(len(seeds)))
 
 
 def evaluate_pack(
-    pack: Pack,
-    robot: RobotCfg,
-    policy: str,
-    *,
-    compute: Compute,
-    terrains: int | None = None,
-    episodes: int | None = None,
-    seed: int = 0,
-    out: Path | None = None,
+    pack: Pack, robot: RobotCfg, policy: str, cfg: SetsCfg, *, compute: Compute, out: Path | None = None
 ) -> dict[str, Any]:
     """Tests one controller on a pack: prints and writes what it fails beside the rates of the pack's controllers.
 
-    ``terrains`` are the first of the pack. Without it and ``episodes`` (a terrain) there are as many as suit the
-    device. Without ``out`` the file lies under runs/.
+    ``cfg`` says how many terrains, the first of the pack, episodes on each, and their seed. Without ``out`` the file
+    lies under runs/.
     """
     size = len(pack.terrains)
-    count, episodes = fill_sizes(compute, terrains, episodes, full=(size, EPISODES), small=(min(24, size), 4))
+    count, episodes = fill_sizes(compute, cfg.terrains, cfg.episodes, full=(size, EPISODES), small=(min(24, size), 4))
     check_policy(policy, robot, compute.device)
-    terrain_set = pack_set(pack.heights, min(count, size), seed)
+    terrain_set = pack_set(pack.heights, count, cfg.seed)
     entries = pack.terrains[: len(terrain_set)]
     if trained := count_trained(entries, policy):
         say((f"It was trained on {trained} of these {len(entries)} terrains", "bold"), ": its rates say little.")
@@ -170,14 +161,14 @@ def evaluate_pack(
         tested = add_rates(entries, {"this": results["pack"][controller]})
         keys = ("robot", "robot_sha256", "terrains_sha256", "episodes", "seed", "searched", "version", "licence")
         return {
-            **compute.origin(seed),
+            **compute.origin(cfg.seed),
             **controller_identity(robot, policy),
             "episodes": episodes,
             "trained_on": trained,
             "pack": {key: pack.content[key] for key in keys} | {"folder": pack.name, "terrains": size},
-            "rates": summarise_rates(tested, "this", seed),
-            "beside": {name: summarise_rates(entries, name, seed) for name in pack.content["rates"]},
-            "by": {group: count_failing(tested, "this", group) for group in _GROUPS},
+            "rates": summarise_rates(tested, "this", cfg.seed),
+            "beside": {name: summarise_rates(entries, name, cfg.seed) for name in pack.content["rates"]},
+            "by": {group: count_failing(tested, "this", group) for group in ("verdict", "cause", "kind")},
             "terrains": tested,
         }
 
@@ -207,11 +198,11 @@ def add_rates(entries: Sequence[Entry], results: Mapping[str, RolloutResult]) ->
     crossed: list[dict[str, Any]] = [{} for _ in entries]
     for controller, result in results.items():
         counted = counted_episodes(result.invalid)
-        goals = (result.reached_goal & counted).sum(axis=1).tolist()
+        counts = zip((result.reached_goal & counted).sum(axis=1).tolist(), counted.sum(axis=1).tolist(), strict=True)
         rates = terrain_rates(result)
-        for k, (row, valid) in enumerate(zip(crossed, counted.sum(axis=1).tolist(), strict=True)):
-            row[controller] = {f"{name}_rate": float(values[k]) if valid else None for name, values in rates.items()}
-            row[controller] |= {"goal_interval": list(wilson_interval(goals[k], valid)), "valid_episodes": valid}
+        for k, (goals, valid) in enumerate(counts):
+            row = {f"{name}_rate": float(values[k]) if valid else None for name, values in rates.items()}
+            crossed[k][controller] = row | {"goal_interval": [*wilson_interval(goals, valid)], "valid_episodes": valid}
     return [entry | {"rates": row} for entry, row in zip(entries, crossed, strict=True)]
 
 

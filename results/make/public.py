@@ -16,6 +16,7 @@ from typing import Any
 from qd.check import ensure_ready, ensure_stray
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
+from qd.evaluate.labels import SetsCfg
 from qd.evaluate.level import measure_level_ground
 from qd.faults.families import Ranking
 from qd.faults.judge import judge
@@ -131,7 +132,7 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     rates, sizes = dict[str, Any](), {"terrains": 4, "episodes": 1} if small else RATES
     for height in HEIGHTS[: 1 if small else None]:
         out, at = runs / f"{name}-rates-{height:g}.json", at_height(SUPER_GAUSSIAN, height).name
-        report = evaluate_rates(robot, policy, compute=compute, space=at, seed=seed, out=out, **sizes)
+        report = evaluate_rates(robot, policy, SetsCfg(space=at, seed=seed, **sizes), compute=compute, out=out)
         common = runs / f"{name}-archive-{height:g}"
         searched = search_at(robot, at, common, compute, seed=seed, small=small, emitters=COMMON_EMITTERS)
         rates[f"{height:g}"] = {key: report[key] for key in ("hand_crafted", "hard_random")} | {"search": searched[1]}

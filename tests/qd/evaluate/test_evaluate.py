@@ -99,8 +99,8 @@ def test_controllers_are_not_tested_on_what_they_were_trained_on(anymal, archive
 def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     robots = Robots(arrives)
-    given = {"compute": compute_by(robots), "terrains": 3, "episodes": 1}
-    report = evaluate_rates(anymal, STAND, **given)
+    cfg, compute = SetsCfg(terrains=3, episodes=1), compute_by(robots)
+    report = evaluate_rates(anymal, STAND, cfg, compute=compute)
     # Under runs/, never under results/, where the published ones stand; another controller has a file of its own.
     written = json.loads(Path("runs/anymal-tests.sim.policies-stand-rates.json").read_text())
     assert written == json.loads(json.dumps(report))
@@ -109,7 +109,7 @@ def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
     # Velocity errors count from 2 s on: 1 (m/s)^2 s in 13 of 15 s.
     assert {cfg.penalties_from_s for cfg in robots.opened} == {2.0}
     assert report["flat"]["vx_error_mean"] == pytest.approx((1 / 13) ** 0.5)
-    evaluate_rates(anymal, str(anymal.policy_file), **given)
+    evaluate_rates(anymal, str(anymal.policy_file), cfg, compute=compute)
     assert Path("runs/anymal-rates.json").exists()
 
 
@@ -311,9 +311,8 @@ def test_rates_over_a_pack_are_means_with_families_drawn_together():
 
 def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     robots = Robots(fails)
-    sizes = {"compute": compute_by(robots), "episodes": 2}
-    stored = packs.read_pack(Path("pack"))
-    report = packs.evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **sizes)
+    given = packs.read_pack(Path("pack")), anymal, "tests.sim.policies:stand"
+    report = packs.evaluate_pack(*given, SetsCfg(terrains=2, episodes=2), compute=compute_by(robots))
     (file,) = Path("runs").glob("anymal-*-pack.json")
     assert json.loads(file.read_text()) == json.loads(json.dumps(report))
     # It fails the first terrain, which is 4 m high, and crosses the flat one.
@@ -324,7 +323,7 @@ def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     shown = capsys.readouterr().out
     assert "1 of 2" in shown and "ridge" in shown
     assert not robots.opened[0].reward and robots.opened[0].engine == "search"
-    whole = packs.evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **sizes)
+    whole = packs.evaluate_pack(*given, SetsCfg(terrains=9, episodes=2), compute=compute_by(robots))
     assert whole["rates"]["terrains"] == 3
 
 
