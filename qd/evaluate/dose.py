@@ -62,8 +62,7 @@ class Dose(Sweep):
     quantities: Mapping[str, Quantity]
     make: Callable[[Mapping[str, Any], int, np.random.Generator], NDArray[np.float32]] = field(compare=False)
     """Makes the terrains of quantities, of which one has several values (:meth:`terrains`)."""
-    space: str = SUPER_GAUSSIAN.name
-    """Terrain space of its genes; of heights any."""
+    space: str = SUPER_GAUSSIAN.name  # terrain space of its genes; of heights any
 
     def describe(self) -> str:
         """The obstacle and its other quantities: ``stairs up, tread 0.30 m, flight 5 steps``."""

@@ -56,23 +56,15 @@ _AT_ONCE = 2_000  # episodes between two looks on a GPU, which many robots keep 
 class CheckCfg:
     """One table ``[[check]]`` of a gate.toml: terrains, and what is asked of controllers on them."""
 
-    name: Name = ""
-    """Of the check in reports; that of its pack or set if left out."""
-    pack: Name = ""
-    """A pack: its folder beside the gate.toml, or a published one: anymal, cassie or anymal@1."""
-    set: str = ""
-    """Or terrains that are drawn: hand_crafted or hard_random."""
-    space: str | None = None
-    """Space of a set, with ground and conditions, as `archive` has it: super_gaussian+noise+push."""
-    terrains: Count = 100
-    """How many: the first of a pack."""
-    limit: Limit | None = None
-    """Mean goal rate that is asked for; none if the check is of old against new alone."""
+    name: Name = ""  # of the check in reports; that of its pack or set if left out
+    pack: Name = ""  # a pack: its folder beside the gate.toml, or a published one: anymal, cassie or anymal@1
+    set: str = ""  # or terrains that are drawn: hand_crafted or hard_random
+    space: str | None = None  # space of hard_random, with ground and conditions: super_gaussian+noise+push
+    terrains: Count = 100  # how many: the first of a pack
+    limit: Limit | None = None  # mean goal rate that is asked for; none if the check is of old against new alone
     margin: Small = 0.05
-    """A rate of limit - margin fails and one of limit + margin passes, but for the error. New may be worse than old by
-    less than this."""
-    rounds: Count = 40
-    """Episodes of a terrain at most."""
+    """Rates of limit - margin fail and of limit + margin pass, but for the error; new may be less worse than old."""
+    rounds: Count = 40  # episodes of a terrain at most
 
     @property
     def title(self) -> str:
@@ -85,10 +77,8 @@ class GateCfg:
     """A gate.toml."""
 
     check: tuple[CheckCfg, ...]
-    error: Small = 0.05
-    """Chance of a wrong pass, and of a wrong fail, of each test that is clear."""
-    seed: NonNegativeInt = 0
-    """Draws terrains of sets, and all episodes."""
+    error: Small = 0.05  # chance of a wrong pass, and of a wrong fail, of each test that is clear
+    seed: NonNegativeInt = 0  # draws terrains of sets, and all episodes
 
 
 def read_gate(file: Path) -> GateCfg:
@@ -119,10 +109,8 @@ class CheckTerrains(NamedTuple):
 
     terrains: Terrains
     sha256: str
-    known: list[Entry]
-    """What a pack says of them; nothing of others."""
-    pack: str | None
-    """The pack by its name and version."""
+    known: list[Entry]  # what a pack says of them; nothing of others
+    pack: str | None  # the pack by its name and version
 
 
 def check_terrains(check: CheckCfg, seed: int, robot: RobotCfg, folder: Path) -> CheckTerrains:

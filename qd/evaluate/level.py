@@ -24,8 +24,7 @@ from sim.robots.user import write_setting
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 
-MIN_GOAL_RATE = 0.9
-"""Share of episodes on level ground that reach the goal, below which a controller does not walk."""
+MIN_GOAL_RATE = 0.9  # share of episodes on level ground that reach the goal, below which a controller does not walk
 _EPISODES = 20
 _MIN_SPEED = 0.15  # a slower controller does not walk, whatever its time [m/s]
 _SPARE_TIME = 1.25  # a crossing gets so many times what it takes on level ground

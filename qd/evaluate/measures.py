@@ -16,26 +16,20 @@ from sim.rates import counted_episodes, terrain_means
 from sim.rollout import RolloutResult
 from sim.terrains.hand_crafted import CROSSING_TYPES
 
-VELOCITY_FROM_S = 2.0
-"""The velocity error counts from this time of an episode on [s]: before it the robot gets going."""
+VELOCITY_FROM_S = 2.0  # the velocity error counts from this time of an episode on [s]: before it the robot gets going
 
 
 @dataclass(frozen=True, kw_only=True)
 class Performance:
     """A controller's numbers on each of T terrains, by valid episodes; NaN where over a quarter of them are invalid."""
 
-    values: dict[str, NDArray[np.float64]]
-    """Mean of each of :data:`qd.evaluate.labels.MEASURES` on each terrain, shape (T,)."""
-    penalties: dict[str, NDArray[np.float64]]
-    """Mean of each scaled penalty on each terrain, shape (T,)."""
-    goals: NDArray[np.int64]
-    """Valid episodes that reached the goal, shape (T,)."""
-    episodes: NDArray[np.int64]
-    """Valid episodes, shape (T,); 0 on an invalid terrain."""
+    values: dict[str, NDArray[np.float64]]  # mean of each of qd.evaluate.labels.MEASURES on each terrain, shape (T,)
+    penalties: dict[str, NDArray[np.float64]]  # mean of each scaled penalty on each terrain, shape (T,)
+    goals: NDArray[np.int64]  # valid episodes that reached the goal, shape (T,)
+    episodes: NDArray[np.int64]  # valid episodes, shape (T,); 0 on an invalid terrain
 
 
-Families = NDArray[np.int64] | None
-"""Number of each terrain's family of kin, shape (T,); None of independent terrains."""
+Families = NDArray[np.int64] | None  # number of each terrain's family of kin, shape (T,); None of independent terrains
 
 
 def valid_mean(values: NDArray[np.float64]) -> float | None:

@@ -42,15 +42,12 @@ from sim.terrains.terrains import Terrains
 
 PACK_FILE = "pack.json"
 TERRAINS_FILE = "pack.npz"
-HEIGHT_UNIT_M = 1e-3
-"""Heights of a pack are whole numbers of it, in its file and where they are crossed [m]."""
-NEAR_GOAL_RATE = 0.75
-"""Goal rate of the searched controller from which on a terrain is no near-fault."""
+HEIGHT_UNIT_M = 1e-3  # heights of a pack are whole numbers of it, in its file and where they are crossed [m]
+NEAR_GOAL_RATE = 0.75  # goal rate of the searched controller from which on a terrain is no near-fault
 _MAX_BYTES = 1e9  # of an array that is read
 _KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
 
-Entry = dict[str, Any]
-"""What a pack says of one terrain, as JSON values; ``rates`` by controller."""
+Entry = dict[str, Any]  # what a pack says of one terrain, as JSON values; rates by controller
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +55,9 @@ class Pack:
     """A pack of N terrains."""
 
     folder: Path
-    heights: NDArray[np.float32]
-    """[m], shape (N, NUM_ROWS, NUM_COLS)."""
-    genes: NDArray[np.float32]
-    """Shape (N, num_genes)."""
-    content: dict[str, Any]
-    """Of ``pack.json``."""
+    heights: NDArray[np.float32]  # [m], shape (N, NUM_ROWS, NUM_COLS)
+    genes: NDArray[np.float32]  # shape (N, num_genes)
+    content: dict[str, Any]  # of pack.json
 
     @property
     def name(self) -> str:

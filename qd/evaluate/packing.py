@@ -42,10 +42,8 @@ class Candidate(NamedTuple):
     """A terrain that a pack may take."""
 
     entry: Entry
-    genes: NDArray[np.float32]
-    """Shape (num_genes,)."""
-    of: NDArray[np.float32]
-    """Genes of the elite that it is, or a part of."""
+    genes: NDArray[np.float32]  # shape (num_genes,)
+    of: NDArray[np.float32]  # genes of the elite that it is, or a part of
 
 
 def make_pack(

@@ -17,8 +17,7 @@ import numpy as np
 from scipy.special import betainc, betaincc, betaln
 from scipy.stats import binomtest
 
-BETS = np.linspace(0.02, 0.98, 49)
-"""Shares of the wealth."""
+BETS = np.linspace(0.02, 0.98, 49)  # shares of the wealth
 
 
 def _log_mixture(goals: int, misses: int, low: float = 0.0, high: float = 1.0) -> float:

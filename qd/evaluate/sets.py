@@ -34,13 +34,10 @@ from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
-TRAINED_ON = "trained_on"
-"""Key of the training record, and of checkpoint and controller, with the marks of all elites trained on."""
+TRAINED_ON = "trained_on"  # key of training record, checkpoint and controller, with the marks of all elites trained on
 _MARK_LENGTH = 12  # of 2,000 elites, two have the same with a chance of one in 100 million
-Purpose = Literal["test", "validation"]
-"""What terrains are for: numbers to report, or the choice of settings."""
-MIN_ELITES = 5
-"""Fewest elites that can be split: a fifth of them is one."""
+Purpose = Literal["test", "validation"]  # what terrains are for: numbers to report, or the choice of settings
+MIN_ELITES = 5  # fewest elites that can be split: a fifth of them is one
 _TRAINING_ELITES = 750  # the paper's
 _HELD_OUT_SHARE = 0.2
 _VALIDATION_SHARE = 0.1  # of as many elites as are trained on
@@ -55,10 +52,8 @@ class EliteSplit:
     """Elites to train on and elites held out, as rows of the archive in the order drawn; the three are disjoint."""
 
     train: NDArray[np.int64]
-    validation: NDArray[np.int64]
-    """Held out for the choice of settings."""
-    test: NDArray[np.int64]
-    """Held out for reported numbers: the first n are a random choice of n of them."""
+    validation: NDArray[np.int64]  # held out for the choice of settings
+    test: NDArray[np.int64]  # held out for reported numbers: the first n are a random choice of n of them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,14 +61,10 @@ class TerrainSet(ColumnTable):
     """T terrains to cross, and what is known of each."""
 
     terrains: Terrains
-    numbers: NDArray[np.int64]
-    """Number of each terrain, shape (T,): an elite's row in the archive, else the index in the set."""
-    types: NDArray[np.int64] | None = None
-    """Index into :data:`sim.terrains.hand_crafted.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
-    levels: NDArray[np.int64] | None = None
-    """Level of each hand-crafted terrain, shape (T,)."""
-    elites: Archive | None = None
-    """The elites as an archive, with their families; None of other terrains."""
+    numbers: NDArray[np.int64]  # of each terrain, shape (T,): an elite's row in the archive, else the index in the set
+    types: NDArray[np.int64] | None = None  # index into CROSSING_TYPES of each hand-crafted terrain, shape (T,)
+    levels: NDArray[np.int64] | None = None  # level of each hand-crafted terrain, shape (T,)
+    elites: Archive | None = None  # the elites as an archive, with their families; None of other terrains
 
     def __len__(self) -> int:
         return len(self.numbers)

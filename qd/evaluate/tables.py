@@ -49,8 +49,7 @@ _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
 
 Value = TypeVar("Value")
-Performances = Mapping[str, Mapping[str, Performance]]
-"""Set -> controller -> its numbers on the set's terrains."""
+Performances = Mapping[str, Mapping[str, Performance]]  # set -> controller -> its numbers on the set's terrains
 
 
 def read_tables(file: Path, robot: RobotCfg) -> Tables:

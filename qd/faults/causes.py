@@ -26,8 +26,7 @@ _NARROW = 0.5  # a part that falls to half of its height within this distance of
 SLIPPERY = "slippery ground"
 SOFT = "soft ground"
 OFF_THE_WAY = "beside the way"
-UNCLEAR = "unclear"
-"""The cause where no part of the terrain lies where robots end."""
+UNCLEAR = "unclear"  # the cause where no part of the terrain lies where robots end
 _STRAIGHT = {"rise": "high", "drop": "deep", "ridge": "high", "ditch": "deep"}
 SHAPES: dict[str, str | None] = {
     **_STRAIGHT,
@@ -51,38 +50,25 @@ _FIRST_MET = 0.9  # share of the steepest slope; the first place that is as stee
 class Shape:
     """How a robot meets a part that lies alone on flat ground. Slopes are those of its steepest place."""
 
-    kind: str
-    """One of :data:`SHAPES`, :data:`SLIPPERY`, :data:`SOFT`, or the cause of a condition; docs/faults.md has limits."""
-    height_m: float
-    """Height under the robot where it is largest, negative of a hollow [m]."""
-    slope_deg: float
-    """Steepest slope under the robot [degrees]."""
-    along_deg: float
-    """Slope along the way, negative where the ground falls [degrees]."""
-    across_deg: float
-    """Slope across the way [degrees]."""
-    oblique_deg: float
-    """Angle between the way and the direction in which the ground rises or falls most, 0 to 90 [degrees]."""
-    length_m: float
-    """Length over which it has at least half of that height, along the way through that place [m]."""
-    left_m: float
-    """How far left of the way it has that height, within 1 m along the way of that place [m]."""
-    right_m: float
-    """How far right of the way [m]; negative where it lies to the left alone."""
+    kind: str  # one of SHAPES, SLIPPERY, SOFT, or the cause of a condition; docs/faults.md has limits
+    height_m: float  # height under the robot where it is largest, negative of a hollow [m]
+    slope_deg: float  # steepest slope under the robot [degrees]
+    along_deg: float  # slope along the way, negative where the ground falls [degrees]
+    across_deg: float  # slope across the way [degrees]
+    oblique_deg: float  # angle between the way and the direction of the steepest rise or fall, 0 to 90 [degrees]
+    length_m: float  # length over which it has at least half of that height, along the way through that place [m]
+    left_m: float  # how far left of the way it has that height, within 1 m along the way of that place [m]
+    right_m: float  # how far right of the way [m]; negative where it lies to the left alone
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
     """What each of some parts of a terrain does."""
 
-    heights: NDArray[np.float32]
-    """Heights that it adds to the others [m], shape (num_parts, nrow, ncol)."""
-    slippery: NDArray[np.bool_]
-    """Patches that it makes slippery, shape (num_parts, rows, cols) of its map."""
-    soft: NDArray[np.bool_]
-    """Patches that it makes soft, of the same shape."""
-    conditions: tuple[str, ...]
-    """The kind of condition that each part sets; empty where it sets none."""
+    heights: NDArray[np.float32]  # heights that it adds to the others [m], shape (num_parts, nrow, ncol)
+    slippery: NDArray[np.bool_]  # patches that it makes slippery, shape (num_parts, rows, cols) of its map
+    soft: NDArray[np.bool_]  # patches that it makes soft, of the same shape
+    conditions: tuple[str, ...]  # the kind of condition that each part sets; empty where it sets none
 
     @property
     def patches(self) -> NDArray[np.bool_]:

@@ -28,13 +28,9 @@ from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import WiderSpace
 
-VERDICTS = ("", "failing", "certified", "confirmed", "fault")
-"""From the least to the most. The controller may cross with contact resolved what is certified alone."""
+VERDICTS = ("", "failing", "certified", "confirmed", "fault")  # from the least to the most
 KIN_M = 0.06
-"""Terrains whose heights differ by less (root mean square) are kin [m], in a space whose bumps are up to 0.25 m high.
-
-Of 850 hard-random terrains no two are.
-"""
+"""Terrains of bumps up to 0.25 m are kin if their heights differ by less (RMS) [m]: no two of 850 hard-random ones."""
 _KIN_SHARE = 0.25  # of a condition's range
 _EVERY = 2  # nodes; distances are compared at 0.1 m
 _BANK = 50  # height maps that are made at once
@@ -63,21 +59,14 @@ def find_verdicts(archive: Archive) -> NDArray[np.int64]:
 class Ranking(Evaluation):
     """N elites by what is known best of each: values of fresh episodes where valid ones exist, else as found."""
 
-    numbers: NDArray[np.int64]
-    """Number of each elite in the archive, shape (N,), ascending."""
-    is_fresh: NDArray[np.bool_]
-    """Whether the values are of fresh episodes, shape (N,)."""
-    verdict: NDArray[np.int64]
-    """Index in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found an elite say whether it fails."""
+    numbers: NDArray[np.int64]  # number of each elite in the archive, shape (N,), ascending
+    is_fresh: NDArray[np.bool_]  # whether the values are of fresh episodes, shape (N,)
+    verdict: NDArray[np.int64]  # index in VERDICTS, shape (N,); without fresh episodes by those that found it
     causes: tuple[str, ...]
-    """What stops the robot on each: the cause of its minimal terrain, else that of the place where its typical episode
-    ends (:func:`qd.faults.causes.find_causes`). Empty where the elite does not fail."""
-    families: NDArray[np.int64]
-    """Family of each, shape (N,), numbered from 1 by its worst member."""
-    asks: Kind = Kind.CROSS
-    """What robots are asked for."""
-    log_likelihood: NDArray[np.float64] | None = None
-    """Of the conditions of each (:func:`sim.terrains.conditions.likely.find_log_likelihood`), shape (N,), if known."""
+    """What stops the robot: by the minimal terrain, else by the typical episode; empty where it does not fail."""
+    families: NDArray[np.int64]  # family of each, shape (N,), numbered from 1 by its worst member
+    asks: Kind = Kind.CROSS  # what robots are asked for
+    log_likelihood: NDArray[np.float64] | None = None  # of the conditions of each, shape (N,), if known
 
     @property
     def orders(self) -> dict[str, str]:

@@ -60,10 +60,8 @@ class Judging:
     search: Search
     certifiers: Mapping[str, str]
     crosser: Crosser
-    most_steered: int | None = None
-    """Terrains for which the stage ``steered`` looks for witnesses at most."""
-    step: str = ""
-    """What bars say before their label."""
+    most_steered: int | None = None  # terrains for which the stage steered looks for witnesses at most
+    step: str = ""  # what bars say before their label
 
     @property
     def origin(self) -> dict[str, Any]:
@@ -376,12 +374,10 @@ def is_decided(counts: NDArray[np.int64], episodes: int) -> NDArray[np.bool_]:
 class Stage(NamedTuple):
     """A step of judging."""
 
-    run: Callable[[Archive, Judging], Archive]
-    """Returns the archive with the stage's columns filled anew."""
-    asks_certifiers: bool = True
-    """Whether certifiers cross terrains in it."""
-    check: Callable[[Archive, Judging, Collection[str]], None] = lambda archive, judging, before: None
-    """Refuses, before anything is crossed, what cannot be judged, by the stages that come before."""
+    run: Callable[[Archive, Judging], Archive]  # returns the archive with the stage's columns filled anew
+    asks_certifiers: bool = True  # whether certifiers cross terrains in it
+    check: Callable[[Archive, Judging, Collection[str]], None] = lambda *_: None
+    """Refuses what cannot be judged after some stages."""
 
 
 STAGES = {

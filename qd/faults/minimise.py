@@ -44,28 +44,23 @@ from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.terrains import Terrains
 
-MAX_PARTS = 10
-"""Parts of a terrain whose subsets, 1,024 at most, are all crossed if need be."""
+MAX_PARTS = 10  # parts of a terrain whose subsets, 1,024 at most, are all crossed if need be
 _MOMENTS = 8  # at equal distances, from which the latest of a push is chosen
 _SCALE_STEPS = 5  # halvings of the interval that holds the least scale which still fails: it is known to 1/32
 _LEAST_EFFECT_M = 1e-4  # a part that changes no height by more is none
 _ROW_EPISODES = 5  # of a row of genes; the episodes of a trial are spread over workers by rows
 
 How = Literal["exhaustive", "greedy"]
-Parts = tuple[int, ...]
-"""Numbers of some parts of a terrain, rising."""
+Parts = tuple[int, ...]  # numbers of some parts of a terrain, rising
 
 
 class Trial(NamedTuple):
     """Some parts of a terrain, to be crossed."""
 
     parts: Parts
-    scale: float = 1.0
-    """What their heights are multiplied by."""
-    moments: tuple[tuple[int, float], ...] = ()
-    """When some parts come that come at some time [s], if not as in the terrain."""
-    fresh: bool = False
-    """Whether to cross in 40 episodes, with other seeds than the 20 by which a subset is found."""
+    scale: float = 1.0  # what their heights are multiplied by
+    moments: tuple[tuple[int, float], ...] = ()  # when some parts come [s], if not as in the terrain
+    fresh: bool = False  # whether to cross in 40 episodes, with other seeds than the 20 by which a subset is found
 
     @property
     def rows(self) -> int:
@@ -77,24 +72,16 @@ class Trial(NamedTuple):
 class Case:
     """A failing terrain that is taken apart; outcomes are by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
 
-    parts: Parts
-    """Parts that change it, in the order in which they are taken away."""
-    how: How
-    """Exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time."""
-    flat: Parts = ()
-    """Parts without heights to scale: slippery patches, conditions. A terrain of these alone is not scaled."""
-    counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)
-    """Outcomes of each trial; those of all parts together, the elite's fresh ones, are there from the start."""
-    minimal: Parts = ()
-    """Parts that it takes to fail, once it was taken apart."""
+    parts: Parts  # parts that change it, in the order in which they are taken away
+    how: How  # exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time
+    flat: Parts = ()  # parts without heights to scale: patches of ground, conditions; these alone are not scaled
+    counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)  # outcomes of each trial
+    minimal: Parts = ()  # parts that it takes to fail, once it was taken apart
     later: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    """When parts come that come at some time, and the latest that they can [s], by part."""
-    moments: tuple[tuple[int, float], ...] = ()
-    """The latest at which parts of the minimal terrain come while it fails, where that is later than they do [s]."""
-    scale: float | None = None
-    """Least scale of their heights that was crossed and fails; None if they cannot be scaled."""
-    passing_scale: float | None = None
-    """Largest scale below it that was crossed and does not fail; None if there is none."""
+    """When a part comes, and can at the latest [s]."""
+    moments: tuple[tuple[int, float], ...] = ()  # the latest at which parts come while it fails, if later [s]
+    scale: float | None = None  # least scale of their heights that was crossed and fails; None if they cannot be scaled
+    passing_scale: float | None = None  # largest scale below it that was crossed and does not fail, if any
 
     @property
     def whole(self) -> Parts:
@@ -127,8 +114,7 @@ class Case:
         return max(rates, key=lambda part: (np.nan_to_num(rates[part], nan=-1.0), rank[part]), default=None)
 
 
-Steps = Generator[list[Trial], None, Any]
-"""Yields trials to be crossed; their outcomes are in the counts of the case when it goes on."""
+Steps = Generator[list[Trial], None, Any]  # yields trials to cross; then their outcomes are in the case
 
 
 def find_minimal(case: Case) -> Steps:

@@ -19,20 +19,14 @@ from sim.files.npz import read_arrays
 from sim.files.templates import open_templates
 from sim.rates import SUCCESS
 
-FRESH_EPISODES = 40
-"""Episodes that each elite is evaluated again with."""
-EPISODES = 20
-"""Episodes of an elite in each further stage of judging."""
-SEARCHED = "searched"
-"""Name of the searched controller among those that are steered."""
-SPECIALIST = "specialist"
-"""Name of the certifier that was trained for one search, on its failing elites; all others form the panel."""
+FRESH_EPISODES = 40  # episodes that each elite is evaluated again with
+EPISODES = 20  # episodes of an elite in each further stage of judging
+SEARCHED = "searched"  # name of the searched controller among those that are steered
+SPECIALIST = "specialist"  # certifier that was trained on the failing elites of one search; all others form the panel
 
-TEMPLATES = open_templates(Path(__file__).parent / "templates")
-"""Texts about elites."""
+TEMPLATES = open_templates(Path(__file__).parent / "templates")  # texts about elites
 _INVALID = OUTCOMES.index("invalid")
-MAX_FALSE_DISCOVERIES = 0.05
-"""Largest expected share of luck among what is significant (Benjamini and Hochberg 1995)."""
+MAX_FALSE_DISCOVERIES = 0.05  # largest expected share of luck among what is significant (Benjamini and Hochberg 1995)
 _COUNTS = (
     "confirmed", "certified", "faults", "faults_panel", "faults_controllers", "faults_witness", "fault_families",
     "fault_families_controllers", "strong", "faults_fdr",
@@ -288,10 +282,8 @@ def judgement(archive: Archive, number: int) -> dict[str, Any]:
 class MinimalTerrains:
     """Minimal terrains of elites of an archive."""
 
-    numbers: dict[str, Any]
-    """The content of ``minimal.json``."""
-    genes: dict[int, NDArray[np.float32]]
-    """By number of the elite, each of shape (num_genes,)."""
+    numbers: dict[str, Any]  # the content of minimal.json
+    genes: dict[int, NDArray[np.float32]]  # by number of the elite, each of shape (num_genes,)
 
     def entry(self, number: int) -> dict[str, Any]:
         """The entry of an elite in ``minimal.json``."""

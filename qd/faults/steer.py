@@ -26,8 +26,7 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.terrains import Terrains
 
-LINE_M, BESIDE_M = 0.5, 1.0
-"""A way is on the line, or beside it, where the robot is never further from the straight line [m]."""
+LINE_M, BESIDE_M = 0.5, 1.0  # on the line, and beside it, a robot is never further from the straight line [m]
 _LINE_EPISODES = 5  # of a terrain, to see how far plain crossings are from the line
 
 
@@ -37,26 +36,16 @@ class SteerCfg:
 
     generations: int = 12
     samples: int = EPISODES
-    best: int = 5
-    """Samples that the next generation is drawn near."""
-    step: float = 0.7
-    """How far the distribution moves toward that of the best samples, as a share."""
-    speed_std: float = 0.3
-    """Of the first generation [m/s]."""
-    offset_std: float = 0.4
-    """[m]; four times as much where no limit holds."""
-    heading_std: float = 0.5
-    """[rad]"""
-    least_std: float = 0.05
-    """Of any generation, of all three."""
-    common: float = 0.5
-    """Share of the variance that all segments of a sample have in common."""
-    smooth: float = 1.5
-    """Reach of the correlation of the rest [segments]."""
-    margin_m: float = 0.05
-    """By which ways stay within the limit [m]."""
-    beyond_cost: float = 20.0
-    """Of a metre beyond that, where a metre that is missing to the goal costs 1."""
+    best: int = 5  # samples that the next generation is drawn near
+    step: float = 0.7  # how far the distribution moves toward that of the best samples, as a share
+    speed_std: float = 0.3  # of the first generation [m/s]
+    offset_std: float = 0.4  # [m]; four times as much where no limit holds
+    heading_std: float = 0.5  # [rad]
+    least_std: float = 0.05  # of any generation, of all three
+    common: float = 0.5  # share of the variance that all segments of a sample have in common
+    smooth: float = 1.5  # reach of the correlation of the rest [segments]
+    margin_m: float = 0.05  # by which ways stay within the limit [m]
+    beyond_cost: float = 20.0  # of a metre beyond that, where a metre that is missing to the goal costs 1
 
     @property
     def seeds(self) -> int:
