@@ -7,6 +7,7 @@ obstacle is an element of a course (:mod:`sim.terrains.elements`) of any size, w
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,7 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import ground_genes
 from sim.terrains.terrains import Terrains
 
-_FULL = (20, 4)  # terrains a value and episodes a terrain
-_SMALL = (8, 2)  # on a machine without a GPU
+_SIZES = {"full": (20, 4), "small": (8, 2)}  # terrains a value and episodes a terrain; small without a GPU
 _COLUMNS = 4
 _RESAMPLES = 1000
 _BEYOND = {"first": "before the first", "last": "beyond the last", "invalid": "unknown, episodes are invalid"}
@@ -61,7 +61,6 @@ class Dose(Sweep):
 
     quantities: Mapping[str, Quantity]
     make: Callable[[Mapping[str, Any], int, np.random.Generator], NDArray[np.float32]] = field(compare=False)
-    """Makes the terrains of quantities, of which one has several values (:meth:`terrains`)."""
     space: str = SUPER_GAUSSIAN.name  # terrain space of its genes; of heights any
 
     def describe(self) -> str:
@@ -99,16 +98,15 @@ class Dose(Sweep):
 def _dose_level(
     name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[Any], NDArray[Any]], height: float = 0.0
 ) -> Dose:
-    """Level ground, whose map or condition has ``to_genes`` of quantities, shape (num_values, number of its genes).
+    """Level ground, or hard-random terrains of a share of their ``height``, whose map or condition has ``to_genes``.
 
-    With a ``height``, in place of level ground there are hard-random terrains of that share of their height.
+    These have shape (num_values, number of its genes).
     """
 
     def make(quantities: Mapping[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         genes = to_genes({**sweep.others, sweep.parameter: quantities[name]})
-        bumps = np.zeros((count, SUPER_GAUSSIAN.num_genes))  # of no height
-        if height:
-            bumps = SUPER_GAUSSIAN.scaled(SUPER_GAUSSIAN.hard_random(count, rng), height)
+        level = np.zeros((count, SUPER_GAUSSIAN.num_genes))
+        bumps = SUPER_GAUSSIAN.scaled(SUPER_GAUSSIAN.hard_random(count, rng), height) if height else level
         rows = np.repeat(bumps, len(genes), axis=0), np.tile(genes, (count, 1))
         return np.concatenate(rows, axis=1).astype(np.float32)
 
@@ -145,7 +143,7 @@ def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
     try:
         for word in " ".join(texts).split():
             name, equals, values = word.partition("=")
-            chosen[name] = [float(value) for value in values.split(",")] if equals else None
+            chosen[name] = [*map(float, values.split(","))] if equals else None
         for word in " ".join(at).split():
             name, _, value = word.partition("=")
             others[name] = float(value)
@@ -179,7 +177,7 @@ def measure_dose(
     Without ``terrains`` (a value) and ``episodes`` (a terrain) there are as many as suit the device. Without ``out``
     the file lies under runs/. The report has ``dose`` (:func:`measure_rates`) and ``half`` (:func:`find_half`).
     """
-    count, episodes = fill_sizes(compute, terrains, episodes, full=_FULL, small=_SMALL)
+    count, episodes = fill_sizes(compute, terrains, episodes, **_SIZES)
     conditions = [name for name in doses if name in CONDITIONS]
     if any(CONDITIONS[name].asks == Kind.ROUTE for name in conditions):
         read_stray(robot, resolved=resolved)  # or refuses
@@ -238,8 +236,7 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
         outcome, fallen = (array[number :: len(dose.values)].ravel() for array in (result.outcome, result.fallen))
         counted = counted_episodes(outcome == Outcome.INVALID)
         count = int(counted.sum())
-        left_out = len(counted) - count
-        row = {**about, "value": value, "controller": controller, "episodes": count, "left_out": left_out}
+        row = {**about, "value": value, "controller": controller, "episodes": count, "left_out": len(counted) - count}
         hits = {"goal": outcome == Outcome.GOAL, "fallen": fallen, "success": outcome != Outcome.BASE_COLLISION}
         for rate, is_hit in hits.items():
             num_hits = int((is_hit & counted).sum())
@@ -258,7 +255,7 @@ def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult)
     """
     crossed = [number for number, row in enumerate(rows) if row["goal_rate"] is not None]
     half: dict[str, Any] = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
-    unknown = {**half, "value": None, "beyond": "invalid", "interval": [None, None]}
+    unknown = half | {"value": None, "beyond": "invalid", "interval": [None, None]}
     if not crossed:
         return unknown
     counted = counted_episodes(result.outcome == Outcome.INVALID)
@@ -300,9 +297,12 @@ def show_dose(report: dict[str, Any]) -> None:
             passed = f"{half['value']:.2f} ({low} to {high})" if half["value"] is not None else _BEYOND[half["beyond"]]
             lines.append((half["controller"], *(format_value(rate, None, ".0%") for rate in rates), passed))
         values = [f"{row['value']:g}" for row in rows if row["controller"] == rows[0]["controller"]]
-        unit = f" [{rows[0]['unit']}]" if rows[0]["unit"] else ""
-        head = (f"{rows[0]['parameter']}{unit}", *values, "half of the robots pass")
+        head = (_label_parameter(rows[0]), *values, "half of the robots pass")
         show_table(f"{title}: robots that pass", head, lines)
+
+
+def _label_parameter(row: Mapping[str, Any]) -> str:
+    return f"{row['parameter']} [{row['unit']}]" if row["unit"] else row["parameter"]
 
 
 def draw_dose(report: Mapping[str, Any]) -> Figure:
@@ -316,22 +316,21 @@ def draw_dose(report: Mapping[str, Any]) -> Figure:
     panels = [figure.add_subplot(rows, columns, number) for number in range(1, 1 + len(elements))]
     for axes, element in zip(panels, elements, strict=True):
         element_rows = [row for row in report["dose"] if row["element"] == element]
-        for number, controller in enumerate(report["controllers"]):
+        styles = zip(report["controllers"], cycle(_COLOURS), cycle(_MARKERS), strict=False)
+        for controller, colour, marker in styles:
             rated = [row for row in element_rows if row["controller"] == controller and row["goal_rate"] is not None]
             values = [row["value"] for row in rated]
-            colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
             rates = [100.0 * row["goal_rate"] for row in rated]
             axes.plot(values, rates, label=controller, color=colour, marker=marker, markersize=4)
             low, high = ([100.0 * row["interval"][end] for row in rated] for end in (0, 1))
             axes.fill_between(values, low, high, color=colour, alpha=0.15, linewidth=0)
-        first, last = element_rows[0], element_rows[-1]
         title, _, others = report["titles"][element].partition(", ")
         axes.set_title(f"{title}\n{others}", fontsize=9)
-        axes.set_xlabel(f"{first['parameter']} [{first['unit']}]" if first["unit"] else first["parameter"], fontsize=8)
+        axes.set_xlabel(_label_parameter(element_rows[0]), fontsize=8)
         axes.set_ylim(-3, 103)
         axes.axhline(100.0 * FAILING_GOAL_RATE, color="0.7", linewidth=0.8, zorder=0)
         axes.tick_params(labelsize=8)
-        if first["value"] > last["value"]:
+        if element_rows[0]["value"] > element_rows[-1]["value"]:
             axes.invert_xaxis()
     for axes in panels[::columns]:
         axes.set_ylabel("pass [%]", fontsize=8)

@@ -158,7 +158,7 @@ def run_check(
             reached[by] = result.reached_goal.reshape(len(some), count) & valid[by]
             goals[by] += [reached[by].sum(axis=0), valid[by].sum(axis=0)]
         done = some.stop
-        hits = {"rate": (reached["new"], valid["new"])}
+        hits: dict[str, tuple[NDArray[np.bool_], ...]] = {"rate": (reached["new"], valid["new"])}
         if "old" in policies:
             both = valid["old"] & valid["new"]
             hits["paired"] = (reached["old"] & ~reached["new"] & both, reached["new"] & ~reached["old"] & both, both)

@@ -54,16 +54,9 @@ class SteerCfg:
 
 
 def seek_witnesses(
-    crosser: Crosser,
-    walkers: Mapping[str, str],
-    terrains: Terrains,
-    seeds: NDArray[np.uint32],
-    limit_m: float,
-    *,
-    rng: np.random.Generator,
-    label: str = "",
-    cfg: SteerCfg | None = None,
-) -> Witnesses:
+    crosser: Crosser, walkers: Mapping[str, str], terrains: Terrains, seeds: NDArray[np.uint32], limit_m: float, *,
+    rng: np.random.Generator, label: str = "", cfg: SteerCfg | None = None,
+) -> Witnesses:  # fmt: skip
     """Witnesses of T terrains: each of the walkers, controllers by name, tries those that have none on the line yet.
 
     A walker first looks for a way on the line, then for any. ``seeds`` have the shape (T, walkers * cfg.seeds).
@@ -97,16 +90,9 @@ def seek_witnesses(
 
 
 def find_ways(
-    crosser: Crosser,
-    policy: str,
-    terrains: Terrains,
-    seeds: NDArray[np.uint32],
-    *,
-    limit_m: float | None,
-    rng: np.random.Generator,
-    label: str,
-    cfg: SteerCfg,
-) -> NDArray[np.float32]:
+    crosser: Crosser, policy: str, terrains: Terrains, seeds: NDArray[np.uint32], *, limit_m: float | None,
+    rng: np.random.Generator, label: str, cfg: SteerCfg,
+) -> NDArray[np.float32]:  # fmt: skip
     """The best way on each of T terrains, shape (T, SEGMENTS, 3), with a seed a generation, (T, generations).
 
     Where ``limit_m`` is not None, ways stay so near to the straight line [m].
