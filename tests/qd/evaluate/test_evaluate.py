@@ -13,7 +13,6 @@ import pytest
 from qd.commands import EvaluateCommand
 from qd.evaluate import evaluate as evaluation
 from qd.evaluate import pack as packs
-from qd.evaluate import packing
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
@@ -169,7 +168,7 @@ def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=
 )
 def test_what_comes_next(candidates, expected):
     for size in (9, 1):  # each beginning of a pack is one
-        assert packing.choose_terrains(candidates, size) == expected[:size]
+        assert packs.choose_terrains(candidates, size) == expected[:size]
 
 
 def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypatch):
@@ -179,7 +178,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     def make(controllers, *others, **changes):
         searches = [*map(find_search, (path, *others))]
         how = {"compute": compute_by(robots), "out": Path("pack"), "overwrite": True}
-        return packing.make_pack(searches, controllers, **how, **changes)
+        return packs.make_pack(searches, controllers, **how, **changes)
 
     compute = compute_by(Robots(bump_stops))
     judge(path, stages=("resolved",), compute=compute)
@@ -219,7 +218,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     assert not {entry["mark"] for entry in new} & {entry["mark"] for entry in content["terrains"]}
     for clash, named in (([path], "twice"), ([], "version 4")):
         with pytest.raises(ValueError, match=named):
-            packing.make_pack(
+            packs.make_pack(
                 [*map(find_search, (path, *clash))],
                 base,
                 compute=compute_by(robots),
@@ -241,7 +240,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
 def test_what_a_steered_robot_crosses_on_the_line_is_a_candidate(anymal, tmp_path):
     search = SimpleNamespace(space=SUPER_GAUSSIAN, run=tmp_path, robot=anymal)
     for archive, passable in ((judged_archive(), [0, 2, 4]), (steered_archive(), [0, 1, 2, 4])):
-        candidates, not_passable = packing.find_candidates([search], [archive])
+        candidates, not_passable = packs.find_candidates([search], [archive])
         assert [candidate.entry["elite"] for candidate in candidates] == passable
         assert not_passable == 5 - len(passable)
         steered = {candidate.entry["elite"] for candidate in candidates if "witness" in candidate.entry}
