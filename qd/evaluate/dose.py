@@ -1,7 +1,7 @@
 """Which real obstacle at which size stops a controller: goal rate against a stair's rise, a ditch's width, friction.
 
-A dose is one obstacle alone on flat ground, or one ground or condition everywhere, of which one number grows. An
-obstacle is an element of a course (:mod:`sim.terrains.elements`) of any size, within the ranges of its space or beyond.
+A dose is one obstacle alone on flat ground, an element of a course of any size (:mod:`sim.terrains.elements`), or one
+ground or condition everywhere, of which one number grows.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -87,10 +87,9 @@ class Dose(Sweep):
         return replace(self, values=tuple(values), others={**self.others, **changed})
 
     def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-        """Terrains of all values, ``count`` each: first one of each value, then the next of each.
+        """Terrains, first one of each value, then the next of each: heights [m], (count * num_values, ...), or genes.
 
         An obstacle begins at ``count`` nodes that are spread evenly over 1 m; all else is the same for all values.
-        Returns heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
         """
         return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
 
@@ -98,10 +97,7 @@ class Dose(Sweep):
 def _dose_level(
     name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[Any], NDArray[Any]], height: float = 0.0
 ) -> Dose:
-    """Level ground, or hard-random terrains of a share of their ``height``, whose map or condition has ``to_genes``.
-
-    These have shape (num_values, number of its genes).
-    """
+    """Level ground, or hard-random terrains of so much ``height``, with a map or condition of (num_values, G) genes."""
 
     def make(quantities: Mapping[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         genes = to_genes({**sweep.others, sweep.parameter: quantities[name]})
@@ -134,10 +130,7 @@ def all_doses() -> dict[str, Dose]:
 
 
 def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
-    """Some of :func:`all_doses`, in their order, as a command line names them; without ``texts`` all but conditions.
-
-    A text holds words ``stairs_up``, with other values ``ditch=0.2,0.4``; ``at`` are other quantities, ``tread=0.25``.
-    """
+    """Some doses, in their order: ``stairs_up``, or ``ditch=0.2,0.4``; ``at`` has other quantities, ``tread=0.25``."""
     doses, chosen, others = all_doses(), dict[str, Sequence[float] | None](), dict[str, float]()
     word = ""
     try:
@@ -174,8 +167,7 @@ def measure_dose(
 ) -> dict[str, Any]:
     """Lets every controller cross every value of every dose; prints, writes and draws the rates.
 
-    Without ``terrains`` (a value) and ``episodes`` (a terrain) there are as many as suit the device. Without ``out``
-    the file lies under runs/. The report has ``dose`` (:func:`measure_rates`) and ``half`` (:func:`find_half`).
+    Without sizes there are as many ``terrains`` (a value) and ``episodes`` (a terrain) as suit the device.
     """
     count, episodes = fill_sizes(compute, terrains, episodes, **_SIZES)
     conditions = [name for name in doses if name in CONDITIONS]
@@ -212,10 +204,7 @@ def measure_dose(
 
 
 def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
-    """The terrains of a dose, those of all values at one place behind each other, so that workers share the hard ones.
-
-    There are ``num_terrains`` a value. The seed draws their episodes, the same ones for all doses.
-    """
+    """Terrains of a dose, all values of one place behind each other: so workers share the hard ones. ``seed`` draws."""
     rng = set_rng("dose", seed)
     seeds = draw_seeds(rng, num_terrains).repeat(len(dose.values))
     values = dose.terrains(num_terrains, rng)
@@ -225,10 +214,7 @@ def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
 
 
 def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult) -> list[dict[str, Any]]:
-    """Rates of one controller on a dose, a row a value, the easiest first.
-
-    A value with more than a quarter of invalid episodes has no rates.
-    """
+    """Rates of one controller on a dose, a row a value, the easiest first; None with too many invalid episodes."""
     unit = dose.quantities[dose.parameter].unit
     about: dict[str, Any] = {"element": name, "parameter": dose.parameter, "unit": unit, "at": dict(dose.others)}
     rows = []
@@ -250,8 +236,8 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
 def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult) -> dict[str, Any]:
     """Where robots begin to pass less than half of the time, by straight lines between the values.
 
-    The ``interval`` is 95 % of a bootstrap over the terrains of a value, from the smallest to the largest. None is
-    beyond the values: ``beyond`` the ``first`` or the ``last``, or where all episodes of a value are ``invalid``.
+    The 95 % ``interval`` is by bootstrap over the terrains of a value. None is ``beyond`` the values: before the
+    ``first``, behind the ``last``, or where all episodes are ``invalid``.
     """
     crossed = [number for number, row in enumerate(rows) if row["goal_rate"] is not None]
     half: dict[str, Any] = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}

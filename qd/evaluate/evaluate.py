@@ -67,10 +67,7 @@ def cross_sets(
     note: str = "",
     **settings: Any,
 ) -> dict[str, dict[str, RolloutResult]]:
-    """Set -> controller -> its crossings, as :meth:`qd.workers.crosser.Crosser.cross` makes them by ``settings``.
-
-    Prints the rates of each, with ``note`` behind the name of the set.
-    """
+    """Set -> controller -> its crossings, by ``settings`` of Crosser.cross; prints rates, ``note`` behind the set."""
     results: dict[str, dict[str, RolloutResult]] = {name: {} for name in sets}
     largest = max(map(len, sets.values()))
     for policy in controllers.values():
@@ -99,8 +96,8 @@ def evaluate(
 ) -> Tables:
     """The tables of controllers, policies by name of which ``shipped`` is the robot's own, on sets of terrains.
 
-    Sets are as of :func:`qd.evaluate.sets.make_sets`, 24 hand-crafted and 24 hard-random terrains if None. The robot is
-    a name or a settings file. Without ``compute`` the CPU crosses. ``seed`` is of bootstraps, ``cache`` of crossings.
+    Without ``sets`` there are 24 hand-crafted and 24 hard-random terrains, without ``compute`` the CPU crosses. The
+    robot is a name or a settings file. ``seed`` is of bootstraps, ``cache`` of crossings.
     """
     robot = get_robot(robot)
     sets = sets or make_sets((), _SMALL[0], seed)
@@ -121,7 +118,7 @@ def evaluate_tables(
 ) -> dict[str, Any]:
     """The tables of controllers with where their terrains come from; prints and writes them, by default under runs/.
 
-    If the controllers are ``old`` and ``new``, they are compared on elites that neither was trained on.
+    Controllers ``old`` and ``new`` are compared on elites that neither was trained on.
     """
     compares = {*controllers} == {"old", "new"}
     if compares:
@@ -184,10 +181,7 @@ def _describe_archive(path: Path, archive: Archive) -> dict[str, Any]:
 def evaluate_rates(
     robot: RobotCfg, policy: str, cfg: SetsCfg, *, compute: Compute, out: Path | None = None
 ) -> dict[str, Any]:
-    """Rates of one controller on hand-crafted and hard-random terrains and its velocity error on flat ground.
-
-    Without ``out`` the file lies under runs/. Returns what ``base.json`` has.
-    """
+    """What ``base.json`` has: rates of one controller and its velocity error; written under runs/ without ``out``."""
     count, episodes = fill_sizes(compute, cfg.terrains, cfg.episodes, full=(300, EPISODES), small=_SMALL)
     check_policy(policy, robot, compute.device)
     space, seed = space_at(load_space(cfg.space), None, robot), cfg.seed

@@ -1,7 +1,6 @@
 """A gate for continuous integration and training: does a controller pass what a gate.toml asks of it?
 
-Episodes are crossed in rounds, one of every terrain, and sequential tests stop as soon as it is clear
-(:mod:`qd.evaluate.sequential`).
+Episodes are crossed in rounds, one of every terrain, until sequential tests are clear (:mod:`qd.evaluate.sequential`).
 """
 
 import hashlib
@@ -131,10 +130,7 @@ def run_check(
     check: CheckCfg, drawn: CheckTerrains, number: int, cfg: GateCfg,
     policies: Mapping[str, str], crosser: Crosser,
 ) -> dict[str, Any]:  # fmt: skip
-    """Crosses rounds until each test is clear: verdicts, counts and terrains that ``new`` fails, as JSON values.
-
-    Invalid episodes are counted, and left out of rates and pairs.
-    """
+    """Crosses rounds until each test is clear: verdicts, counts of valid episodes, and terrains that ``new`` fails."""
     began = time.perf_counter()
     terrains, known = drawn.terrains, drawn.known
     count, name = len(terrains), check.title
@@ -213,10 +209,9 @@ def run_gate(
     file: Path, cfg: GateCfg, drawn: Sequence[CheckTerrains], robot: RobotCfg, policies: Mapping[str, str],
     compute: Compute,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs the checks of a gate.toml on the controller ``new`` of ``policies``, against ``old`` if there is one.
+    """Runs the checks of a gate.toml, ``drawn`` their terrains, on ``new`` of the policies, against ``old`` if it is there.
 
-    ``cfg`` are the file's settings, ``drawn`` the terrains of each check. A controller that does not cross level ground
-    fails, and is not asked further. Returns JSON values.
+    A controller that does not cross level ground fails, and is not asked further. Returns JSON values.
     """
     if lone := [check.title for check in cfg.check if check.limit is None and "old" not in policies]:
         rule = "a check without a limit is of old against new"
@@ -296,10 +291,7 @@ def to_markdown(report: Mapping[str, Any]) -> str:
 
 
 def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], folder: Path) -> None:
-    """Writes some terrains of each failed check as height maps, which `faultline film --terrain` takes.
-
-    Those that old crosses come first. Terrains with ground or conditions, which a map does not have, are left out.
-    """
+    """Writes height maps of failed checks for `faultline film --terrain`, none with ground or conditions."""
     for old in folder.glob("*.npz"):
         old.unlink()
     for number, (found, of_check) in enumerate(zip(report["checks"], drawn, strict=False), 1):
@@ -323,10 +315,9 @@ def publish_gate(
     out: Path | None = None,
     junit: Path | None = None,
 ) -> dict[str, Any]:
-    """Runs a gate (:func:`run_gate`), prints its summary and writes it: as JSON, beside it as .md, and as JUnit XML.
+    """Runs a gate, prints its summary and writes it: as JSON, beside it as .md, and as JUnit XML.
 
-    Where GITHUB_STEP_SUMMARY names a file, the summary is added to it. Some terrains that it fails lie in a folder
-    beside it, named as it is.
+    GITHUB_STEP_SUMMARY may name a file to which the summary is added. A folder named as the JSON has failed terrains.
     """
     out = out or RUNS / f"{crosser_name(robot, policies['new'])}-gate.json"
     if out.suffix != ".json" or (junit is not None and junit.resolve() in (out.resolve(), out.with_suffix(".md"))):

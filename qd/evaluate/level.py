@@ -36,9 +36,8 @@ Walks = dict[str, dict[str, float]]
 def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = False) -> Walks:
     """How a controller walks over level ground here, ``searched``, and if asked in MuJoCo C, ``mujoco_c``.
 
-    Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` toward the goal until the
-    end [m/s], and ``height`` of the base at the end [m]; all are 0 without a valid episode. What was measured of a
-    user's robot as it is, under this controller, is read from its file; the rest is added to it.
+    Each has valid ``episodes``, the share ``goal`` that reaches it, ``speed`` toward the goal [m/s], and ``height`` of
+    the base at the end [m]; all are 0 without a valid episode. What is known of a user's robot is read from its file.
     """
     robot = crosser.robot
     file, identity = robot.home / f"{crosser_name(robot, policy)}.level.json", controller_identity(robot, policy)

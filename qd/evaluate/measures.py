@@ -57,11 +57,10 @@ def kind_mean(
 ) -> dict[str, Any] | None:
     """The mean of a measure for one kind of controller, or the difference of two kinds, the first minus the second.
 
-    ``values`` has the measure for each kind, shape (num_trainings, num_terrains); ``seed`` is that of the bootstrap.
-    Returns ``mean``, its 95 % ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain
-    that is valid for all. The variance is that over families, by the bootstrap, and that over the trainings of each
-    kind; the interval is Student's with Satterthwaite's degrees of freedom (1946), and no narrower than the
-    bootstrap's. One training says nothing of others.
+    ``values`` has the measure for each kind, shape (num_trainings, num_terrains). Returns ``mean``, its 95 %
+    ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain that is valid for all. The
+    variance is that over families, by the bootstrap, and that over trainings; the interval is Student's with
+    Satterthwaite's degrees of freedom (1946), and no narrower than the bootstrap's. One training says nothing of others.
     """
     valid = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in values])
     if not valid.any():
@@ -137,10 +136,7 @@ def summarise_crossings(
 
 
 def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
-    """Error of v_x from 2 s to the end of each valid episode [m/s], base frame: the root of its mean square over time.
-
-    ``vx_error_mean`` is the mean of the episodes' errors. Penalties must be summed from :data:`VELOCITY_FROM_S` on.
-    """
+    """Error of v_x in valid episodes, of penalties from :data:`VELOCITY_FROM_S` on: root of its mean square [m/s]."""
     counted_s = result.duration_s - VELOCITY_FROM_S
     usable = ~result.invalid & (counted_s > 0.0)
     error = np.sqrt(result.penalties[..., result.penalty_names.index("vel_x")] / np.where(usable, counted_s, 1.0))

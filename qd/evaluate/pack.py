@@ -112,10 +112,7 @@ def read_pack(folder: Path) -> Pack:
 
 
 def write_terrains(folder: Path, heights: NDArray[np.float32], genes: NDArray[np.float32]) -> str:
-    """Writes ``pack.npz``, atomically; equal content gives equal bytes. Returns its SHA-256.
-
-    Heights [m], rounded, have shape (N, NUM_ROWS, NUM_COLS), genes (N, num_genes).
-    """
+    """Writes ``pack.npz`` of rounded heights [m], (N, NUM_ROWS, NUM_COLS), and genes; returns its SHA-256."""
     units = np.rint(heights.astype(np.float64) / HEIGHT_UNIT_M).astype(np.int32)
     # Of smooth ground the rise along x hardly changes along y, so that this packs into a third of the bytes.
     twists = np.diff(np.diff(units, axis=2, prepend=np.int32(0)), axis=1, prepend=np.int32(0))
@@ -139,11 +136,7 @@ def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
 def evaluate_pack(
     pack: Pack, robot: RobotCfg, policy: str, cfg: SetsCfg, *, compute: Compute, out: Path | None = None
 ) -> dict[str, Any]:
-    """Tests one controller on a pack: prints and writes what it fails beside the rates of the pack's controllers.
-
-    ``cfg`` says how many terrains, the first of the pack, episodes on each, and their seed. Without ``out`` the file
-    lies under runs/.
-    """
+    """Tests a controller on the first terrains of a pack: prints and writes what it fails beside the pack's controllers."""
     size = len(pack.terrains)
     count, episodes = fill_sizes(compute, cfg.terrains, cfg.episodes, full=(size, EPISODES), small=(min(24, size), 4))
     check_policy(policy, robot, compute.device)
@@ -189,10 +182,7 @@ def passes(report: dict[str, Any], min_goal_rate: float) -> bool:
 
 
 def add_rates(entries: Sequence[Entry], results: Mapping[str, RolloutResult]) -> list[Entry]:
-    """Entries of terrains with the ``rates`` of controllers, None on an invalid terrain.
-
-    Each controller has three rates, the interval of the goal rate (Wilson), and how many episodes are valid.
-    """
+    """Entries with the ``rates`` of controllers, and the goal rate's interval (Wilson); None on an invalid terrain."""
     crossed: list[dict[str, Any]] = [{} for _ in entries]
     for controller, result in results.items():
         counted = counted_episodes(result.invalid)
@@ -210,11 +200,7 @@ def _read_rates(entries: Sequence[Entry], controller: str, name: str) -> NDArray
 
 
 def summarise_rates(entries: Sequence[Entry], controller: str, seed: int) -> dict[str, Any]:
-    """Means of a controller's rates over terrains with 95 % intervals, bootstrap over families, as JSON values.
-
-    Beside ``goal_rate``, ``goal_interval`` and so on: of the valid ``terrains`` how many are ``failing``, and of their
-    ``families`` in how many one is (``failing_families``).
-    """
+    """Means of rates with intervals over families, and how many terrains and families are ``failing``, as JSON values."""
     families = np.array([entry["family"] for entry in entries], np.int64)
     summary: dict[str, Any] = {}
     for name in RATES:
@@ -403,8 +389,7 @@ def drop_kin(candidates: Sequence[Candidate], apart_from: Sequence[Archive], sea
 def find_candidates(searches: Sequence[Search], archives: Sequence[Archive]) -> tuple[list[Candidate], int]:
     """The faults and near-faults of runs: elites as they are, and minimal terrains that lack some of their parts.
 
-    Families are those of the elites of all runs; a minimal terrain is of its elite's. An elite that several runs have
-    counts once. Returns how many more terrains fail that nobody is known to cross, too.
+    Families are over all runs; what several runs have counts once. Returns how many more nobody is known to cross, too.
     """
     near: list[NDArray[np.int64]] = []
     for archive in archives:
@@ -477,8 +462,7 @@ def _candidates_of(
 def choose_terrains(entries: Sequence[Entry], size: int) -> list[int]:
     """Indices of some candidates, so that each beginning of the list is spread as well as can be.
 
-    Next comes a fault before a near-fault, then one of the family that was chosen least often, of the cause that was,
-    of the kind (elite or minimal) that was, and then the one with the lowest goal rate.
+    Faults come first, then the families, causes and kinds that were chosen least often, then the lowest goal rates.
     """
     left = list(range(len(entries)))
     chosen: list[int] = []

@@ -1,11 +1,8 @@
 """The terrains that controllers are evaluated on, and which elites of an archive are held out of training.
 
-A test set is drawn from random numbers used nowhere else: not in training, calibration or search. All controllers cross
-the same terrains with the same episode seeds. Validation sets, by which settings are chosen, have other terrains of the
-same kinds: no setting is chosen by the reported terrains.
-
-The archive determines which elites are held out. An archive that grew holds out others, and a controller may have been
-trained on some of them before: the marks of its elites, in its file or in its training record, say so.
+A test set is drawn from random numbers used nowhere else. All controllers cross the same terrains with the same seeds.
+Validation sets, by which settings are chosen, have other terrains of the same kinds. An archive that grew holds other
+elites out; the marks of those trained on, in a controller's file or its training record, say which it has seen.
 """
 
 import hashlib
@@ -88,10 +85,9 @@ def paper_terrains(robot: str) -> int:
 def split_elites(archive: Archive, *, held_out: bool = True) -> EliteSplit:
     """Draw at random which elites are trained on and which are held out; without ``held_out`` all are trained on.
 
-    If the archive has as many elites as the paper's, 750 are trained on and 300 (ANYmal) or 180 (Cassie) are tested on;
-    else 80 % and 20 %. Validation has a tenth as many as training, at least one, from those left over; if too few are
-    left over, training has fewer. The draw depends on the elites' genes alone, not on their order in the file: judging
-    an archive again, which reorders it, changes no elite's purpose.
+    Of as many elites as the paper's, 750 are trained on and 300 (ANYmal) or 180 (Cassie) tested on; else 80 % and 20 %.
+    Validation has a tenth as many as training from those left over, or else of training's. The draw depends on the
+    genes alone: judging an archive again, which reorders it, changes no elite's purpose.
     """
     if not held_out:
         none = np.zeros(0, np.int64)
@@ -193,10 +189,7 @@ def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.
 def nearest_distance(
     genes: NDArray[np.float32], training_genes: NDArray[np.float32], space: TerrainSpace = SUPER_GAUSSIAN
 ) -> NDArray[np.float64]:
-    """Root mean square distance over all nodes [m] of T height maps to the nearest training map, shape (T,).
-
-    Genes have shape (T, num_genes) and (N, num_genes). Computed on the CPU, so that it is the same everywhere.
-    """
+    """RMS distance [m] of T height maps to the nearest of N others, (T,); on the CPU, so that it is the same everywhere."""
     banks = (make_heights(rows, space) for rows in (genes, training_genes))
     maps, training_maps = (bank.reshape(len(bank), -1).astype(np.float64) for bank in banks)
     banks = (training_maps[first : first + _BANK] for first in range(0, len(training_maps), _BANK))
@@ -215,8 +208,7 @@ def make_sets(
 ) -> dict[str, TerrainSet]:
     """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`; without names all possible ones.
 
-    A set has ``count`` terrains, or all that the archive holds out. ``archive`` has the elites for ``generated`` and
-    ``generated_far``, ``independent`` those for ``generated_independent``; hard-random terrains are of ``space``.
+    Each has ``count`` terrains, or all there are: elites that ``archive`` holds out, or of ``independent``, or of ``space``.
     """
     lacking = {*(HELD_OUT if archive is None else ()), *((INDEPENDENT,) if independent is None else ())}
     names = names or [name for name in SETS if name not in lacking]

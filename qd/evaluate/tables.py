@@ -1,9 +1,8 @@
 """The evaluation's tables: what ``tables.json`` says of controllers on sets of terrains.
 
-A controller *fails* a terrain if under half of its valid episodes reach the goal; an episode with a base collision
-does not. Between two controllers, a terrain is *mended* (the first fails, the second does not), *still failing* (both
-fail), *newly broken* (the second alone fails) or *fine* (neither fails). Where a goal rate is near a half, a change may
-be chance. A change is *clear* if the 95 % intervals (Wilson) of the two goal rates do not overlap.
+A controller *fails* a terrain if under half of its valid episodes reach the goal. Between two controllers, a terrain is
+*mended* (the first alone fails), *still failing*, *newly broken* (the second alone fails) or *fine*. A change is *clear*
+if the 95 % intervals (Wilson) of the two goal rates do not overlap; else it may be chance.
 """
 
 import re
@@ -31,18 +30,13 @@ from sim.robots.robot import RobotCfg, check_robot_digest
 Tables = dict[str, Any]
 """Numbers of controllers on sets of terrains, as JSON values; rates are fractions, None where no terrain is valid.
 
-- ``goal``, ``success``, ``fallen``, ``reward``: set -> controller -> mean over the set's terrains; ``certified_goal``
-  and ``certified_success`` over its certified terrains alone; ``penalties`` by penalty, scaled.
-- ``intervals``: measure -> set -> controller -> 95 % interval, None where the spread is unknown.
-- ``over_seeds``: measure -> set -> kind with several controllers -> ``mean``, ``interval`` over terrains and
-  controllers, and ``values`` of the controllers.
-- ``certified``: set -> number of ``terrains``; ``certifiers``, how many terrains each certifies; and ``chosen_by``,
-  controller -> ``certifier``, whose rate on them is biased upward, or ``searched``, whose rate is biased downward.
-- ``differences``: set -> ``first -> second`` -> ``compared`` terrains, which are valid for both; ``mended``,
-  ``still_failing``, ``newly_broken`` and ``fine``, each with its ``count`` and the numbers of its ``terrains`` (not of
-  the fine ones); how many changes are ``clear``; ``gain``, measure -> ``mean`` difference with its ``interval``.
-- ``terrains``: set -> number of terrains; ``episodes``: number on each.
-- ``controllers``: ``policy`` and ``sha256`` by name.
+- ``goal``, ``success``, ``fallen``, ``reward``: set -> controller -> mean; ``certified_goal`` and ``certified_success``
+  over certified terrains alone; ``penalties`` by penalty, scaled; ``intervals``: measure -> the same.
+- ``over_seeds``: measure -> set -> kind with several controllers -> ``mean``, ``interval``, ``values``.
+- ``certified``: set -> ``terrains``; ``certifiers``, how many each certifies; ``chosen_by``, controller ->
+  ``certifier``, whose rate on them is biased upward, or ``searched``, whose rate is biased downward.
+- ``differences``: set -> ``first -> second`` -> ``compared`` terrains; fates, each with ``count``, ``terrains`` and how
+  many are ``clear``; ``gain``, measure -> ``mean`` difference with its ``interval``.
 """
 _MEASURES = (*MEASURES, *CERTIFIED)
 _WIDTH = 160  # of tables in a file
@@ -184,10 +178,7 @@ def difference(before: Performance, after: Performance, terrains: TerrainSet, se
 
 
 def is_regression(tables: Mapping[str, Any]) -> bool:
-    """Whether the goal rate's difference of :data:`COMPARED` elites, new minus old, has an interval wholly below 0.
-
-    A terrain that newly fails is no regression alone: of hundreds some do by chance. Tables of other sets have none.
-    """
+    """Whether :data:`COMPARED` elites have a difference of the goal rate, new minus old, wholly below 0."""
     pairs = tables["differences"].get(COMPARED)
     interval = pairs["old -> new"]["gain"]["goal"]["interval"] if pairs else None
     return interval is not None and interval[1] < 0.0

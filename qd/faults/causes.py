@@ -141,13 +141,11 @@ def find_causes(
 ) -> list[str]:
     """What stops robots that end at a place of each terrain: the kind of a :class:`Shape`, or :data:`UNCLEAR`.
 
-    It is the part which, alone on flat ground, has the largest difference of heights near that place. Where that is
-    under 3 cm it is slippery or soft ground, or unclear. How near was chosen on half of the elites in
-    results/ whose minimal terrain is known. On the other half it names the kind of the minimal terrain's cause in six
-    of ten, a part drawn at random in three of ten; in seven of ten if oblique kinds count as straight ones.
+    It is the part which, alone on flat ground, has the largest difference of heights near that place; where that is
+    under 3 cm, slippery or soft ground. How near was chosen on half of the elites in results/ with minimal terrains. Of
+    the others it names the cause's kind in six of ten, in seven if oblique counts as straight; a random part in three.
 
-    Genes have shape (N, num_genes). ``ends`` are world-local x and y of the places [m], shape (N, 2), NaN where they
-    are not known; ``half_width`` is that of the robot's stance [m].
+    Genes have shape (N, num_genes), ``ends`` are world-local x and y [m], (N, 2), NaN where they are not known.
     """
     return [_find_cause(*terrain, space, half_width) for terrain in zip(genes, ends, strict=True)]
 

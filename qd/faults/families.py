@@ -164,9 +164,8 @@ def rank(
 ) -> Ranking:
     """The ranking of an archive that has elites.
 
-    Minimal terrains say best what the cause is. ``half_width`` is that of the robot's stance [m]. ``judged`` leaves out
-    elites with invalid fresh episodes; ``numbers`` are elites to rank alone. ``likely`` says how conditions are
-    distributed.
+    Minimal terrains say best what the cause is. ``judged`` leaves out elites with invalid fresh episodes; ``numbers``
+    are elites to rank alone. ``likely`` says how conditions are distributed.
     """
     values, is_fresh = best_values(archive)
     chosen = np.arange(len(archive)) if numbers is None else np.array(numbers, np.int64)
@@ -215,10 +214,7 @@ def find_failing_causes(archive: Archive, space: TerrainSpace, half_width: float
 
 
 def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
-    """Number of the family of each terrain, from 0 in the order of its first member, shape (N,).
-
-    Kin of kin are one family. Genes have shape (N, num_genes).
-    """
+    """Number of each terrain's family, kin of kin, from 0 in the order of first members, (N,), of genes (N, num_genes)."""
     _, families = connected_components(kin_distances(genes, space) < 1.0, directed=False)
     return families.astype(np.int64)
 
@@ -234,10 +230,7 @@ def pick_distinct(distances: NDArray[np.float64], least: float = 1.0) -> NDArray
 def judged_numbers(
     archive: Archive, space: TerrainSpace, likely: Mapping[str, Disturbance] | None = None
 ) -> dict[str, Any]:
-    """The numbers of faults (:func:`fault_numbers`), how many failing elites and faults are distinct, and which likely.
-
-    ``likely`` says how conditions are distributed, if that is known.
-    """
+    """The numbers of faults, how many are distinct, and if it is known how conditions are distributed, the likeliest."""
     numbers = fault_numbers(archive)
     distances = kin_distances(archive.genes[archive.failing], space)
     faults = archive.is_fault[archive.failing]
@@ -261,8 +254,7 @@ def _find_likeliest(log_likelihood: NDArray[np.float64], chosen: NDArray[np.bool
 def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:
     """Distances of terrains, genes of shape (N, num_genes), to each other, shape (N, N); below 1 they are kin.
 
-    A distance is the larger of two: the heights' over :data:`KIN_M`, which is scaled to the space, and the largest
-    change of a condition's number over a quarter of its range.
+    The larger of two: heights' over :data:`KIN_M`, scaled to the space, and a condition's over a quarter of its range.
     """
     if not len(genes):
         return np.zeros((0, 0))
@@ -276,10 +268,7 @@ def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np
 
 @cache
 def height_over_paper(space: TerrainSpace) -> float:
-    """Height of a space without ground and conditions over 0.25 m, the height of the paper's.
-
-    Of a user's space, which has none, the root mean square height of random terrains over that of the paper's.
-    """
+    """Height of a space without ground and conditions over the paper's, of a user's by the RMS of random terrains."""
     if isinstance(space, ShippedSpace):
         return space.height_share
     user, paper = (each.hard_random(_BANK, 0) for each in (space, SUPER_GAUSSIAN))

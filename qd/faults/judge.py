@@ -96,30 +96,21 @@ def open_judging(
 
 
 def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> NDArray[np.uint32]:
-    """Seeds of episodes on N elites, ``times`` in succession for each, shape (N * times,).
-
-    They follow from the seed of the search and from what names an elite, its cell and the iteration that found it.
-    """
+    """Seeds on N elites, ``times`` for each, (N * times,), by the search's seed, and the elite's cell and iteration."""
     names = zip(archive.iteration.tolist(), archive.cell.tolist(), strict=True)
     rows = [np.random.SeedSequence([seed, *name], spawn_key=(stream,)).generate_state(times) for name in names]
     return np.concatenate([np.zeros(0, np.uint32), *rows]).astype(np.uint32)
 
 
 def count_outcomes(result: RolloutResult, limit_m: float = np.inf) -> NDArray[np.int64]:
-    """Episodes of each terrain by :data:`qd.search.archive.OUTCOMES`, shape (num_terrains, 4).
-
-    Those that were further than ``limit_m`` from the straight line have not reached the goal.
-    """
+    """Episodes by :data:`qd.search.archive.OUTCOMES`, (num_terrains, 4); no goal is beyond ``limit_m`` from the line."""
     flags = (result.reached_goal & (result.deviation <= limit_m), result.base_collision, result.invalid)
     goal, collided, invalid = (flag.sum(axis=1) for flag in flags)
     return np.stack([goal, collided, result.invalid.shape[1] - goal - collided - invalid, invalid], axis=1)
 
 
 def cross_fresh(archive: Archive, judging: Judging) -> Archive:
-    """Crosses every elite in 40 fresh episodes, since an elite is the best of many noisy evaluations.
-
-    Returns the archive with fresh values, families and causes, by descending corrected fitness.
-    """
+    """Crosses every elite in 40 fresh episodes, since it was lucky; orders the archive by the corrected fitness."""
     search = judging.search
     terrains = judging.elite_terrains(archive, slice(None), Stream.FRESH)
     label = f"{judging.step}fresh episodes"
@@ -305,10 +296,7 @@ def _check_mujoco_c(archive: Archive, judging: Judging, before: Collection[str])
 
 
 def cross_in_mujoco_c(archive: Archive, judging: Judging) -> Archive:
-    """Crosses 150 faults in MuJoCo C with contact resolved, by the controller, and where it fails by a certifier.
-
-    Each in 6 episodes, and in 4 more unless these decide whether half of the 10 reach the goal.
-    """
+    """Crosses faults in MuJoCo C with contact resolved, until decided: by the controller, where it fails by a certifier."""
     _check_certifiers(archive, judging, steered=True)
     search = judging.search
     rounds = len(MUJOCO_C_EPISODES)
@@ -362,10 +350,7 @@ def split_families(archive: Archive, rows: NDArray[np.int64]) -> tuple[NDArray[n
 
 
 def is_decided(counts: NDArray[np.int64], episodes: int) -> NDArray[np.bool_]:
-    """Whether the first of ``episodes`` show, however the others end, if half of them reach the goal, shape (N,).
-
-    Counts by :data:`qd.search.archive.OUTCOMES` have shape (N, 4). Not decided as long as too many are invalid.
-    """
+    """Whether outcomes so far, (N, 4), decide if half of ``episodes`` reach the goal, (N,); not with many invalid ones."""
     goal, collided, other, _ = counts.T
     lead, rest = goal - collided - other, episodes - counts.sum(axis=1)
     return ((lead >= rest) | (lead < -rest)) & ~np.isnan(goal_rates(counts))
@@ -403,8 +388,8 @@ def judge(
 ) -> Archive:
     """Judges the elites of a search in stages, and writes the run's archive, numbers and figures after each.
 
-    ``stages`` are some of :data:`STAGES`, ``certifiers`` other controllers by name, those of :func:`find_certifiers` if
-    None; robot, policy and space are as :func:`qd.faults.searches.find_search` takes them.
+    ``stages`` are some of :data:`STAGES`, ``certifiers`` other controllers by name, by default those at hand; robot,
+    policy and space are as :func:`qd.faults.searches.find_search` takes them.
     """
     if unknown := [name for name in stages if name not in STAGES]:
         raise ValueError(f"stages must be some of {', '.join(STAGES)}, got {', '.join(unknown)}")

@@ -1,9 +1,8 @@
 """Minimal terrains: the fewest parts of a failing terrain on which the controller still fails, and which is the cause.
 
-A terrain has parts, such as bumps. Robots cross some of its parts alone, 20 episodes each; a subset fails if under half
-of them reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes check
-it. Pushes come as late as they still make it fail. Then its heights are scaled down together as long as it still fails.
-Minimal terrains are judged like elites.
+Robots cross some of a terrain's parts alone, 20 episodes each; a subset fails if under half of them reach the goal. A
+minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes check it. Pushes come as late as
+they still make it fail. Then its heights are scaled down together as long as it still fails.
 """
 
 import math
@@ -137,10 +136,7 @@ def find_minimal(case: Case) -> Steps:
 
 
 def _find_latest(case: Case) -> Steps:
-    """The latest moments of parts at which the minimal terrain still fails, one part after another.
-
-    They count if 40 fresh episodes fail there, too, and no part can be taken away there.
-    """
+    """The latest moments at which the minimal terrain still fails, in fresh episodes, too, and no part can be left out."""
     moments = ()
     for part, (time_s, latest) in case.later.items():
         if part in case.minimal:
@@ -236,10 +232,7 @@ def open_case(
 
 
 def take_apart(archive: Archive, cases: Mapping[int, Case], judging: Judging) -> None:
-    """Finds the minimal terrains of some elites, all of them together, by number of the elite.
-
-    All subsets of an elite are crossed from the same starts, fresh episodes from others.
-    """
+    """Finds the minimal terrains of some elites, by number, all together; subsets of one have the same starts."""
     search = judging.search
     seeds = {}
     for fresh, stream in ((False, Stream.MINIMISED), (True, Stream.MINIMISED_FRESH)):
@@ -277,10 +270,9 @@ def minimise(
 ) -> MinimalTerrains | None:
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
-    Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first, then
-    confirmed, certified and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
-    terrains are crossed with contact resolved and by certifiers too; all else is as :func:`qd.faults.judge.judge` takes
-    it. Returns what the run has now; None without a failing elite.
+    Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first. With
+    ``judged`` minimal terrains are crossed with contact resolved and by certifiers; all else is as
+    :func:`qd.faults.judge.judge` takes it. Returns what the run has now; None without a failing elite.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     with open_judging(search, compute, certifiers, ask=judged) as judging:

@@ -136,9 +136,8 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
 def find_significant(archive: Archive) -> NDArray[np.bool_]:
     """Whether it is no luck that a certifier crosses a failing elite more often than the searched controller, (N,).
 
-    Fisher's exact test, one-sided, compares the searched controller's episodes with contact resolved with a certifier's
-    of both kinds. The worse p counts, and of C certifiers the smallest p times C. Benjamini and Hochberg's procedure
-    holds the share of false discoveries among the failing elites at 5 %.
+    By Fisher's exact test, one-sided, against both kinds of a certifier's episodes: the worse p, and of C certifiers
+    the smallest p times C. Benjamini and Hochberg's procedure holds the share of false discoveries at 5 %.
     """
     both = np.stack([archive.certifier_outcomes, archive.certifier_resolved_outcomes])
     others = archive.resolved_outcomes[:, None]
@@ -261,8 +260,7 @@ def rate_numbers(counts: NDArray[np.int64]) -> dict[str, Any]:
 def judgement(archive: Archive, number: int) -> dict[str, Any]:
     """What is known of an elite under other conditions, as JSON values; None where nobody looked.
 
-    ``resolved`` is the rate with contact resolved, ``varied`` under varied conditions. ``certificates`` has name and
-    hash of each controller that certifies it, and its rates at the ``searched`` settings and under the same conditions.
+    ``certificates`` has each certifier's name, hash, and rates at the ``searched`` settings and under the same conditions.
     """
     resolved = archive.resolved_outcomes[number]
     varied = None if archive.varied is None else archive.varied.searched[number]

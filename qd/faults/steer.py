@@ -93,10 +93,7 @@ def find_ways(
     crosser: Crosser, policy: str, terrains: Terrains, seeds: NDArray[np.uint32], *, limit_m: float | None,
     rng: np.random.Generator, label: str, cfg: SteerCfg,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """The best way on each of T terrains, shape (T, SEGMENTS, 3), with a seed a generation, (T, generations).
-
-    Where ``limit_m`` is not None, ways stay so near to the straight line [m].
-    """
+    """The best way on each terrain, (T, SEGMENTS, 3), within ``limit_m`` of the line [m]; a seed a generation, (T, G)."""
     mean, std, limits = first_ways(len(terrains), crosser.robot, policy, limit_m, cfg)
     with Bar(label, cfg.generations) as bar:
         for generation in range(cfg.generations):
@@ -144,10 +141,7 @@ def move_to_best(
     mean: NDArray[np.floating], std: NDArray[np.floating], samples: NDArray[np.floating], score: NDArray[np.floating],
     cfg: SteerCfg,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:  # fmt: skip
-    """Mean and deviation of the next generation of T terrains, shape (T, ...): those of this one, moved to the best.
-
-    Samples have shape (T, S, ...) and scores (T, S).
-    """
+    """Mean and deviation of the next generation, (T, ...): this one's, moved to the best of (T, S, ...) by (T, S) scores."""
     order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
     best = np.take_along_axis(samples, order.reshape(*order.shape, *[1] * (mean.ndim - 1)), axis=1)
     arrives = (score.max(axis=1) > 0.0).reshape(-1, *[1] * (mean.ndim - 1))  # else it is drawn as widely
@@ -156,10 +150,7 @@ def move_to_best(
 
 
 def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
-    """How good the way of each episode is, shape (T, R): to the goal, and soon; else far ahead; within the limit.
-
-    ``longest_s`` is the time after which a crossing ends [s]. A way that leads to the goal has more than 0.
-    """
+    """How good each way is, (T, R): soon at the goal within ``longest_s`` [s], over 0; else far ahead; within the limit."""
     missing = np.abs(CrossingCfg.goal[0] - result.final_position[..., 0])  # ahead: to go aside costs nothing
     soon = 10.0 - 2.0 * result.duration_s / longest_s
     score = np.where(result.reached_goal, soon, -missing - result.base_collision)
@@ -219,10 +210,7 @@ def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def measure_line(crosser: Crosser, policy: str, terrains: Terrains, label: str = "") -> float:
-    """Largest distance from the straight line of a way on the line [m].
-
-    It is :data:`LINE_M`, or the 95th percentile of the distances of plain crossings of ``terrains`` if that is more.
-    """
+    """Largest distance from the line of a way on it [m]: :data:`LINE_M`, or the 95th percentile of plain crossings."""
     label = f"{label}how far from the straight line it goes unsteered"
     result = crosser.cross(policy, terrains, replicas=_LINE_EPISODES, invalid_ok=True, label=label)
     distances = result.deviation[result.reached_goal]
