@@ -209,7 +209,7 @@ def run_gate(
     file: Path, cfg: GateCfg, drawn: Sequence[CheckTerrains], robot: RobotCfg, policies: Mapping[str, str],
     compute: Compute,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs the checks of a gate.toml, ``drawn`` their terrains, on ``new`` of the policies, against ``old`` if it is there.
+    """Runs the checks of a gate.toml on ``drawn`` terrains, by ``new`` of the policies, against ``old`` if it is there.
 
     A controller that does not cross level ground fails, and is not asked further. Returns JSON values.
     """

@@ -136,7 +136,7 @@ def pack_set(heights: NDArray[np.float32], count: int, seed: int) -> TerrainSet:
 def evaluate_pack(
     pack: Pack, robot: RobotCfg, policy: str, cfg: SetsCfg, *, compute: Compute, out: Path | None = None
 ) -> dict[str, Any]:
-    """Tests a controller on the first terrains of a pack: prints and writes what it fails beside the pack's controllers."""
+    """Tests a controller on the first terrains of a pack: prints and writes its rates beside the pack's controllers."""
     size = len(pack.terrains)
     count, episodes = fill_sizes(compute, cfg.terrains, cfg.episodes, full=(size, EPISODES), small=(min(24, size), 4))
     check_policy(policy, robot, compute.device)
@@ -200,7 +200,7 @@ def _read_rates(entries: Sequence[Entry], controller: str, name: str) -> NDArray
 
 
 def summarise_rates(entries: Sequence[Entry], controller: str, seed: int) -> dict[str, Any]:
-    """Means of rates with intervals over families, and how many terrains and families are ``failing``, as JSON values."""
+    """Means of rates with intervals over families, and how many terrains and families fail, as JSON values."""
     families = np.array([entry["family"] for entry in entries], np.int64)
     summary: dict[str, Any] = {}
     for name in RATES:

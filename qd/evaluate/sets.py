@@ -189,7 +189,7 @@ def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.
 def nearest_distance(
     genes: NDArray[np.float32], training_genes: NDArray[np.float32], space: TerrainSpace = SUPER_GAUSSIAN
 ) -> NDArray[np.float64]:
-    """RMS distance [m] of T height maps to the nearest of N others, (T,); on the CPU, so that it is the same everywhere."""
+    """RMS distance [m] of T height maps to the nearest training map, (T,); on the CPU, so it is the same everywhere."""
     banks = (make_heights(rows, space) for rows in (genes, training_genes))
     maps, training_maps = (bank.reshape(len(bank), -1).astype(np.float64) for bank in banks)
     banks = (training_maps[first : first + _BANK] for first in range(0, len(training_maps), _BANK))
@@ -208,7 +208,7 @@ def make_sets(
 ) -> dict[str, TerrainSet]:
     """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`; without names all possible ones.
 
-    Each has ``count`` terrains, or all there are: elites that ``archive`` holds out, or of ``independent``, or of ``space``.
+    Each has ``count`` terrains, or all that there are; elites are of ``archive``, held out, and ``independent``.
     """
     lacking = {*(HELD_OUT if archive is None else ()), *((INDEPENDENT,) if independent is None else ())}
     names = names or [name for name in SETS if name not in lacking]

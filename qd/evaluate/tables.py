@@ -1,8 +1,8 @@
 """The evaluation's tables: what ``tables.json`` says of controllers on sets of terrains.
 
 A controller *fails* a terrain if under half of its valid episodes reach the goal. Between two controllers, a terrain is
-*mended* (the first alone fails), *still failing*, *newly broken* (the second alone fails) or *fine*. A change is *clear*
-if the 95 % intervals (Wilson) of the two goal rates do not overlap; else it may be chance.
+*mended* (the first alone fails), *still failing*, *newly broken* (the second alone fails) or *fine*. A change is
+*clear* if the 95 % intervals (Wilson) of the two goal rates do not overlap; else it may be chance.
 """
 
 import re

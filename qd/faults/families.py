@@ -214,7 +214,7 @@ def find_failing_causes(archive: Archive, space: TerrainSpace, half_width: float
 
 
 def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
-    """Number of each terrain's family, kin of kin, from 0 in the order of first members, (N,), of genes (N, num_genes)."""
+    """Family of each terrain, kin of kin, by genes (N, num_genes): (N,), from 0 in the order of first members."""
     _, families = connected_components(kin_distances(genes, space) < 1.0, directed=False)
     return families.astype(np.int64)
 
@@ -230,7 +230,7 @@ def pick_distinct(distances: NDArray[np.float64], least: float = 1.0) -> NDArray
 def judged_numbers(
     archive: Archive, space: TerrainSpace, likely: Mapping[str, Disturbance] | None = None
 ) -> dict[str, Any]:
-    """The numbers of faults, how many are distinct, and if it is known how conditions are distributed, the likeliest."""
+    """The numbers of faults, how many are distinct, and where distributions of conditions are known, the likeliest."""
     numbers = fault_numbers(archive)
     distances = kin_distances(archive.genes[archive.failing], space)
     faults = archive.is_fault[archive.failing]

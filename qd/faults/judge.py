@@ -103,7 +103,7 @@ def elite_seeds(archive: Archive, seed: int, times: int = 1, *, stream: int) -> 
 
 
 def count_outcomes(result: RolloutResult, limit_m: float = np.inf) -> NDArray[np.int64]:
-    """Episodes by :data:`qd.search.archive.OUTCOMES`, (num_terrains, 4); no goal is beyond ``limit_m`` from the line."""
+    """Episodes by :data:`qd.search.archive.OUTCOMES`, (T, 4); beyond ``limit_m`` from the line is not the goal."""
     flags = (result.reached_goal & (result.deviation <= limit_m), result.base_collision, result.invalid)
     goal, collided, invalid = (flag.sum(axis=1) for flag in flags)
     return np.stack([goal, collided, result.invalid.shape[1] - goal - collided - invalid, invalid], axis=1)
@@ -296,7 +296,7 @@ def _check_mujoco_c(archive: Archive, judging: Judging, before: Collection[str])
 
 
 def cross_in_mujoco_c(archive: Archive, judging: Judging) -> Archive:
-    """Crosses faults in MuJoCo C with contact resolved, until decided: by the controller, where it fails by a certifier."""
+    """Crosses faults in MuJoCo C with contact resolved, by the controller, and where it fails by a certifier."""
     _check_certifiers(archive, judging, steered=True)
     search = judging.search
     rounds = len(MUJOCO_C_EPISODES)
@@ -350,7 +350,7 @@ def split_families(archive: Archive, rows: NDArray[np.int64]) -> tuple[NDArray[n
 
 
 def is_decided(counts: NDArray[np.int64], episodes: int) -> NDArray[np.bool_]:
-    """Whether outcomes so far, (N, 4), decide if half of ``episodes`` reach the goal, (N,); not with many invalid ones."""
+    """Whether outcomes so far, (N, 4), decide if half of ``episodes`` reach the goal, (N,); too many invalid do not."""
     goal, collided, other, _ = counts.T
     lead, rest = goal - collided - other, episodes - counts.sum(axis=1)
     return ((lead >= rest) | (lead < -rest)) & ~np.isnan(goal_rates(counts))

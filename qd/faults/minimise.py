@@ -136,7 +136,7 @@ def find_minimal(case: Case) -> Steps:
 
 
 def _find_latest(case: Case) -> Steps:
-    """The latest moments at which the minimal terrain still fails, in fresh episodes, too, and no part can be left out."""
+    """The latest moments at which the terrain still fails, in fresh episodes too, and no part can be left out."""
     moments = ()
     for part, (time_s, latest) in case.later.items():
         if part in case.minimal:

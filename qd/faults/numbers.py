@@ -260,7 +260,7 @@ def rate_numbers(counts: NDArray[np.int64]) -> dict[str, Any]:
 def judgement(archive: Archive, number: int) -> dict[str, Any]:
     """What is known of an elite under other conditions, as JSON values; None where nobody looked.
 
-    ``certificates`` has each certifier's name, hash, and rates at the ``searched`` settings and under the same conditions.
+    ``certificates`` has each certifier's name, hash, and rates at the search's settings and under these conditions.
     """
     resolved = archive.resolved_outcomes[number]
     varied = None if archive.varied is None else archive.varied.searched[number]

@@ -93,7 +93,7 @@ def find_ways(
     crosser: Crosser, policy: str, terrains: Terrains, seeds: NDArray[np.uint32], *, limit_m: float | None,
     rng: np.random.Generator, label: str, cfg: SteerCfg,
 ) -> NDArray[np.float32]:  # fmt: skip
-    """The best way on each terrain, (T, SEGMENTS, 3), within ``limit_m`` of the line [m]; a seed a generation, (T, G)."""
+    """The best way on each terrain, (T, SEGMENTS, 3), within ``limit_m`` of the line; seeds are (T, generations)."""
     mean, std, limits = first_ways(len(terrains), crosser.robot, policy, limit_m, cfg)
     with Bar(label, cfg.generations) as bar:
         for generation in range(cfg.generations):
@@ -141,7 +141,7 @@ def move_to_best(
     mean: NDArray[np.floating], std: NDArray[np.floating], samples: NDArray[np.floating], score: NDArray[np.floating],
     cfg: SteerCfg,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:  # fmt: skip
-    """Mean and deviation of the next generation, (T, ...): this one's, moved to the best of (T, S, ...) by (T, S) scores."""
+    """Mean and deviation of the next generation, (T, ...): moved to the best samples (T, S, ...) by scores (T, S)."""
     order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
     best = np.take_along_axis(samples, order.reshape(*order.shape, *[1] * (mean.ndim - 1)), axis=1)
     arrives = (score.max(axis=1) > 0.0).reshape(-1, *[1] * (mean.ndim - 1))  # else it is drawn as widely
@@ -150,7 +150,7 @@ def move_to_best(
 
 
 def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
-    """How good each way is, (T, R): soon at the goal within ``longest_s`` [s], over 0; else far ahead; within the limit."""
+    """How good each way is, (T, R): over 0 at the goal, best soon; else far ahead; less where beyond the limit."""
     missing = np.abs(CrossingCfg.goal[0] - result.final_position[..., 0])  # ahead: to go aside costs nothing
     soon = 10.0 - 2.0 * result.duration_s / longest_s
     score = np.where(result.reached_goal, soon, -missing - result.base_collision)
