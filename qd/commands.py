@@ -385,7 +385,7 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         if self.policies and {*controllers} != {"old", "new"}:
             raise ValueError(f"--gate compares --policies old=A new=B, got {', '.join(controllers)}: use these names")
         controllers = controllers or {"new": self.policy or str(robot.policy_file)}
-        report = publish_gate(file, robot, controllers, _compute(self), out=self.out, junit=self.junit)
+        report = publish_gate(file, robot, controllers, _compute(self), self.out, self.junit)
         return int(not report["passes"])
 
 

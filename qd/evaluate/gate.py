@@ -307,13 +307,7 @@ def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], fold
 
 
 def publish_gate(
-    file: Path,
-    robot: RobotCfg,
-    policies: Mapping[str, str],
-    compute: Compute,
-    *,
-    out: Path | None = None,
-    junit: Path | None = None,
+    file: Path, robot: RobotCfg, policies: Mapping[str, str], compute: Compute, out: Path | None, junit: Path | None
 ) -> dict[str, Any]:
     """Runs a gate, prints its summary and writes it: as JSON, beside it as .md, and as JUnit XML.
 

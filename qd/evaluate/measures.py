@@ -29,9 +29,6 @@ class Performance:
     episodes: NDArray[np.int64]  # valid episodes, shape (T,); 0 on an invalid terrain
 
 
-Families = NDArray[np.int64] | None  # number of each terrain's family of kin, shape (T,); None of independent terrains
-
-
 def valid_mean(values: NDArray[np.float64]) -> float | None:
     """Mean over terrains, shape (T,), without the invalid ones, which are NaN; None without any."""
     valid = values[~np.isnan(values)]
@@ -39,7 +36,7 @@ def valid_mean(values: NDArray[np.float64]) -> float | None:
 
 
 def valid_interval(
-    values: NDArray[np.float64], seed: int, families: Families, bounds: tuple[float, float] | None
+    values: NDArray[np.float64], seed: int, families: NDArray[np.int64] | None, bounds: tuple[float, float] | None
 ) -> list[float] | None:
     """95 % interval of :func:`valid_mean`: bootstrap over terrains, or over their families."""
     valid = ~np.isnan(values)
@@ -53,7 +50,7 @@ def measure_bounds(measure: str, *, differences: bool = False) -> tuple[float, f
 
 
 def kind_mean(
-    values: Sequence[NDArray[np.float64]], families: Families, seed: int, measure: str = "goal"
+    values: Sequence[NDArray[np.float64]], families: NDArray[np.int64] | None, seed: int, measure: str = "goal"
 ) -> dict[str, Any] | None:
     """The mean of a measure for one kind of controller, or the difference of two kinds, the first minus the second.
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,8 @@ _MEASURES = (*MEASURES, *CERTIFIED)
 _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
 
-Value = TypeVar("Value")
+Sets = Mapping[str, TerrainSet]
+Controllers = Mapping[str, Mapping[str, str | None]]  # policy and sha256 by name
 Performances = Mapping[str, Mapping[str, Performance]]  # set -> controller -> its numbers on the set's terrains
 
 
@@ -73,13 +74,7 @@ def as_tables(content: Any) -> Tables:
 
 
 def make_tables(
-    performances: Performances,
-    sets: Mapping[str, TerrainSet],
-    robot: RobotCfg,
-    *,
-    controllers: Mapping[str, Mapping[str, str | None]],
-    episodes: int,
-    seed: int,
+    performances: Performances, sets: Sets, robot: RobotCfg, *, controllers: Controllers, episodes: int, seed: int
 ) -> Tables:
     """The tables of controllers on sets of terrains."""
     means: dict[str, dict[str, Any]] = {key: {} for key in (*_MEASURES, "penalties")}
@@ -128,24 +123,21 @@ def _list_measures(
             yield key, {name: np.where(certified, measured.values[measure], np.nan) for name, measured in row.items()}
 
 
-def _count_certified(
-    sets: Mapping[str, TerrainSet], controllers: Mapping[str, Mapping[str, str | None]]
-) -> dict[str, Any]:
+def _count_certified(sets: Sets, controllers: Controllers) -> dict[str, Any]:
     certified = {}
     for name, terrains in sets.items():
         elites = terrains.elites
         if elites is None or not elites.certifiers:
             continue
-        certificates = elites.certificates & elites.failing[:, None]
-        certifiers = dict(zip(elites.certifiers, certificates.sum(axis=0).tolist(), strict=True))
-        hashes = dict(zip(elites.certifiers, elites.certifier_sha256, strict=True))
-        roles: dict[str | None, str] = {elites.policy_sha256: "searched"}
-        roles |= {hashes[certifier]: "certifier" for certifier, count in certifiers.items() if count}
+        counts = (elites.certificates & elites.failing[:, None]).sum(axis=0).tolist()
+        roles = {elites.policy_sha256: "searched"}
+        roles |= {digest: "certifier" for digest, count in zip(elites.certifier_sha256, counts, strict=True) if count}
         roles.pop(None, None)
-        known = {name: about["sha256"] for name, about in controllers.items() if about["sha256"] in roles}
-        chosen_by = {name: roles[digest] for name, digest in known.items()}
-        terrains_certified = int(elites.certified_by_controllers.sum())
-        certified[name] = {"terrains": terrains_certified, "certifiers": certifiers, "chosen_by": chosen_by}
+        certified[name] = {
+            "terrains": int(elites.certified_by_controllers.sum()),
+            "certifiers": dict(zip(elites.certifiers, counts, strict=True)),
+            "chosen_by": {by: roles[about["sha256"]] for by, about in controllers.items() if about["sha256"] in roles},
+        }
     return certified
 
 
@@ -153,11 +145,10 @@ def difference(before: Performance, after: Performance, terrains: TerrainSet, se
     """What became of each terrain of a set from one controller to another, and the mean gain of the second."""
     valid = (before.episodes > 0) & (after.episodes > 0)
     failed, fails = (valid & (controller.values["goal"] < FAILING_GOAL_RATE) for controller in (before, after))
-    limits = _wilson_limits(before)
-    then_limits = _wilson_limits(after)
+    counts = (zip(by.goals.tolist(), by.episodes.tolist(), strict=True) for by in (before, after))
+    limits, then_limits = (np.array([wilson_interval(*pair) for pair in pairs]) for pairs in counts)
     clear = (limits[:, 1] < then_limits[:, 0]) | (then_limits[:, 1] < limits[:, 0])
-    mended = failed & ~fails
-    broken = ~failed & fails
+    mended, broken = failed & ~fails, ~failed & fails
 
     def describe(mask: NDArray[np.bool_]) -> dict[str, Any]:
         return {"count": int(mask.sum()), "terrains": np.sort(terrains.numbers[mask]).tolist()}
@@ -184,12 +175,6 @@ def is_regression(tables: Mapping[str, Any]) -> bool:
     return interval is not None and interval[1] < 0.0
 
 
-def _wilson_limits(measured: Performance) -> NDArray[np.float64]:
-    """Interval of the goal rate on each terrain, shape (T, 2); anything possible on an invalid one."""
-    counts = zip(measured.goals.tolist(), measured.episodes.tolist(), strict=True)
-    return np.array([wilson_interval(goals, episodes) for goals, episodes in counts])
-
-
 def check_seeds(controllers: Mapping[str, str]) -> None:
     """Refuses the same training twice under one kind, since an interval over seeds needs different ones."""
     names: dict[tuple[str, str], str] = {}
@@ -202,15 +187,15 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
         names[key] = name
 
 
-def by_kind(row: Mapping[str, Value]) -> dict[str, list[Value]]:
+def by_kind(row: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Groups values of controllers, by name, by their kinds: C-G, C-G@1 and C-G@2 differ in their seeds alone."""
-    kinds: dict[str, list[Value]] = {}
+    kinds: dict[str, list[Any]] = {}
     for name, value in row.items():
         kinds.setdefault(name.partition("@")[0], []).append(value)
     return kinds
 
 
-def over_seeds(performances: Performances, sets: Mapping[str, TerrainSet], seed: int) -> dict[str, Any]:
+def over_seeds(performances: Performances, sets: Sets, seed: int) -> dict[str, Any]:
     """Mean over the controllers of each kind that has several: measure -> set -> kind."""
     summaries: dict[str, dict[str, dict[str, Any]]] = {}
     for name, row in performances.items():

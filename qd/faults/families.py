@@ -136,8 +136,7 @@ class Ranking(Evaluation):
             values = self.families if by == "family" else np.asarray(getattr(self, by))
             sign = 1 if by in ("family", "goal_rate") else -1
             return severity[np.argsort(sign * values[severity], kind="stable")]
-        families = self.families.tolist()
-        leading: dict[int, int] = {}  # families by row
+        families, leading = self.families.tolist(), dict[int, int]()  # leading families by row
         for rows in self.by_cause().values():
             leader = next((row for row in rows.tolist() if families[row] not in leading.values()), int(rows[0]))
             leading[leader] = families[leader]
@@ -167,12 +166,11 @@ def rank(
     Minimal terrains say best what the cause is. ``judged`` leaves out elites with invalid fresh episodes; ``numbers``
     are elites to rank alone. ``likely`` says how conditions are distributed.
     """
-    values, is_fresh = best_values(archive)
     chosen = np.arange(len(archive)) if numbers is None else np.array(numbers, np.int64)
     if judged and archive.fresh is not None:
-        chosen = chosen[is_fresh[chosen]]
-    values = {name: value[chosen] for name, value in values.items()}
+        chosen = chosen[archive.fresh.valid[chosen]]
     archive = archive.rows(chosen)
+    values, is_fresh = best_values(archive)
     families = find_families(archive.genes, space) if archive.family is None else archive.family
     causes = find_failing_causes(archive, space, half_width) if archive.cause is None else archive.cause
     entries = minima.numbers["elites"] if minima else []
@@ -181,7 +179,7 @@ def rank(
     ranking = Ranking(
         **values,
         numbers=chosen,
-        is_fresh=is_fresh[chosen],
+        is_fresh=is_fresh,
         verdict=np.maximum(find_verdicts(archive), values["goal_rate"] < FAILING_GOAL_RATE),
         causes=tuple(cause and minimal_causes.get(number, cause) for number, cause in known),
         families=families,
@@ -234,21 +232,18 @@ def judged_numbers(
     numbers = fault_numbers(archive)
     distances = kin_distances(archive.genes[archive.failing], space)
     faults = archive.is_fault[archive.failing]
-    known = {"failing": numbers["failing"] is not None, "faults": numbers["faults_panel"] is not None}
-    for name, some in (("failing", distances), ("faults", distances[faults][:, faults])):
-        numbers[f"{name}_distinct"] = int(pick_distinct(some).sum()) if known[name] else None
+    for name, known, some in (
+        ("failing", numbers["failing"], distances),
+        ("faults", numbers["faults_panel"], distances[faults][:, faults]),
+    ):
+        numbers[f"{name}_distinct"] = None if known is None else int(pick_distinct(some).sum())
     if likely:
         values = find_log_likelihood(space.condition_rows(archive.genes), likely)
-        chosen = {"failing": archive.failing, "faults": archive.is_fault}
-        numbers["likeliest"] = {name: _find_likeliest(values, some) for name, some in chosen.items()}
+        numbers["likeliest"] = likeliest = dict[str, dict[str, Any] | None]()
+        for name, some in (("failing", archive.failing), ("faults", archive.is_fault)):
+            elite = max(np.flatnonzero(some & np.isfinite(values)).tolist(), key=values.__getitem__, default=None)
+            likeliest[name] = None if elite is None else {"elite": elite, "log_likelihood": float(values[elite])}
     return numbers
-
-
-def _find_likeliest(log_likelihood: NDArray[np.float64], chosen: NDArray[np.bool_]) -> dict[str, Any] | None:
-    """Number and log-likelihood of the likeliest of some elites, (N,); None where all are ruled out."""
-    values = np.where(chosen, log_likelihood, -np.inf)
-    elite = int(values.argmax()) if len(values) else 0
-    return {"elite": elite, "log_likelihood": float(values[elite])} if np.isfinite(values).any() else None
 
 
 def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:

@@ -122,16 +122,14 @@ def find_minimal(case: Case) -> Steps:
     case.moments = yield from _find_latest(case)
     if set(case.minimal) <= set(case.flat):
         return
-    passing = 0.0
-    failing = 1.0
+    case.scale, passing = 1.0, 0.0
     for _ in range(_SCALE_STEPS):
-        trial = Trial(case.minimal, scale=(passing + failing) / 2, moments=case.moments)
+        trial = Trial(case.minimal, scale=(passing + case.scale) / 2, moments=case.moments)
         yield from _missing(case, trial)
         if case.fails(trial):
-            failing = trial.scale
+            case.scale = trial.scale
         else:
             passing = trial.scale
-    case.scale = failing
     case.passing_scale = passing or None
 
 
