@@ -10,7 +10,6 @@ import numpy as np
 
 from qd.evaluate.labels import COMPARED, HELD_OUT, MEASURES, RATES, SETS, SetsCfg
 from qd.evaluate.level import report_level_ground
-from qd.evaluate.measures import VELOCITY_FROM_S, measure, summarise_crossings, terrain_rates, velocity_error
 from qd.evaluate.sets import (
     TerrainSet,
     check_untrained,
@@ -22,7 +21,20 @@ from qd.evaluate.sets import (
     read_trained_on,
     split_elites,
 )
-from qd.evaluate.tables import Tables, check_seeds, make_tables, rate_cells, show_comparison, show_table, show_tables
+from qd.evaluate.tables import (
+    VELOCITY_FROM_S,
+    Tables,
+    check_seeds,
+    make_tables,
+    measure,
+    rate_cells,
+    show_comparison,
+    show_table,
+    show_tables,
+    summarise_crossings,
+    terrain_rates,
+    velocity_error,
+)
 from qd.faults.numbers import EPISODES
 from qd.search.archive import ARCHIVE_FILE, Archive
 from qd.search.directory import RUNS, read_robot_archive, search_seed

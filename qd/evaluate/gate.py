@@ -61,8 +61,7 @@ class CheckCfg:
     space: str | None = None  # space of hard_random, with ground and conditions: super_gaussian+noise+push
     terrains: Count = 100  # how many: the first of a pack
     limit: Limit | None = None  # mean goal rate that is asked for; none if the check is of old against new alone
-    margin: Small = 0.05
-    """Rates of limit - margin fail and of limit + margin pass, but for the error; new may be less worse than old."""
+    margin: Small = 0.05  # limit - margin fails, limit + margin passes, but for the error; new may be less worse
     rounds: Count = 40  # episodes of a terrain at most
 
     @property
@@ -337,11 +336,7 @@ def publish_gate(
 
 
 class GateProcess:
-    """A gate that runs in a process of its own, beside a training: it holds none of the training's GPU memory.
-
-    Attributes:
-        out: File of the report, which is there once the process has ended.
-    """
+    """A gate in a process of its own, beside a training, whose GPU memory it does not hold; ``out`` gets its report."""
 
     def __init__(self, command: Sequence[str], out: Path) -> None:
         prepare_output(out)
@@ -387,13 +382,9 @@ def gate(
 ) -> GateProcess:  # fmt: skip
     """Starts a gate of a controller's file in a process of its own, and returns at once.
 
-    Args:
-        policy: File of the controller, as ``--policy`` takes it; it must stay until the gate has ended.
-        robot: Name of a shipped robot, or settings file of another.
-        gate: A gate.toml.
-        out: File of the report.
-        old: Controller that it is compared with.
-        device: A Warp device; CUDA if there is one.
+    ``policy`` and ``old``, with which it is compared, are files that must stay until the gate has ended; ``robot`` is a
+    shipped one or a settings file, ``gate`` a gate.toml. The report goes to ``out``. Without ``device`` it takes CUDA
+    if there is one.
     """
     command = [sys.executable, "-m", "faultline", "evaluate", "--gate", str(gate), "--robot", robot, "--out", str(out)]
     command += ["--policy", str(policy)] if old is None else ["--policies", f"old={old}", f"new={policy}"]

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
 from qd.evaluate.labels import MEASURES, RATES, SetsCfg
-from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
 from qd.evaluate.sets import TerrainSet, draw_seeds, elites_sha256, hash_elites, read_trained_on, set_rng
-from qd.evaluate.tables import rate_cells, show_table
+from qd.evaluate.tables import rate_cells, show_table, terrain_rates, valid_interval, valid_mean
 from qd.faults.families import VERDICTS, find_families, find_verdicts, kin_distances, rank
 from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers, read_minimal
 from qd.faults.searches import Search, find_certifiers

@@ -29,8 +29,7 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import WiderSpace
 
 VERDICTS = ("", "failing", "certified", "confirmed", "fault")  # from the least to the most
-KIN_M = 0.06
-"""Terrains of bumps up to 0.25 m are kin if their heights differ by less (RMS) [m]: no two of 850 hard-random ones."""
+KIN_M = 0.06  # terrains of bumps up to 0.25 m are kin if their heights differ by less (RMS) [m]: no two random ones
 _KIN_SHARE = 0.25  # of a condition's range
 _EVERY = 2  # nodes; distances are compared at 0.1 m
 _BANK = 50  # height maps that are made at once
@@ -62,8 +61,7 @@ class Ranking(Evaluation):
     numbers: NDArray[np.int64]  # number of each elite in the archive, shape (N,), ascending
     is_fresh: NDArray[np.bool_]  # whether the values are of fresh episodes, shape (N,)
     verdict: NDArray[np.int64]  # index in VERDICTS, shape (N,); without fresh episodes by those that found it
-    causes: tuple[str, ...]
-    """What stops the robot: by the minimal terrain, else by the typical episode; empty where it does not fail."""
+    causes: tuple[str, ...]  # by the minimal terrain, else the typical episode; empty where the robot does not fail
     families: NDArray[np.int64]  # family of each, shape (N,), numbered from 1 by its worst member
     asks: Kind = Kind.CROSS  # what robots are asked for
     log_likelihood: NDArray[np.float64] | None = None  # of the conditions of each, shape (N,), if known

@@ -76,8 +76,7 @@ class Case:
     flat: Parts = ()  # parts without heights to scale: patches of ground, conditions; these alone are not scaled
     counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)  # outcomes of each trial
     minimal: Parts = ()  # parts that it takes to fail, once it was taken apart
-    later: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    """When a part comes, and can at the latest [s]."""
+    later: Mapping[int, tuple[float, float]] = field(default_factory=dict)  # when a part comes, and at the latest [s]
     moments: tuple[tuple[int, float], ...] = ()  # the latest at which parts come while it fails, if later [s]
     scale: float | None = None  # least scale of their heights that was crossed and fails; None if they cannot be scaled
     passing_scale: float | None = None  # largest scale below it that was crossed and does not fail, if any
