@@ -17,16 +17,8 @@ from numpy.typing import NDArray
 
 from kernels.episode import Kind
 from qd.evaluate.sets import plain_set
+from qd.faults import numbers as faults
 from qd.faults.families import find_failing_causes, find_families, judged_numbers
-from qd.faults.numbers import (
-    EPISODES,
-    FRESH_EPISODES,
-    FURTHER_NUMBERS,
-    SEARCHED,
-    best_certifier,
-    found_numbers,
-    fresh_numbers,
-)
 from qd.faults.searches import Search, check_certifiers, find_certifiers, find_search
 from qd.faults.steer import LINE_M, SteerCfg, measure_line, seek_witnesses
 from qd.search.archive import OUTCOMES, Archive, CrossedAgain, FreshValues, goal_rates, no_witnesses, write_archive
@@ -78,7 +70,7 @@ class Judging:
         self, policy: str, terrains: Terrains, label: str, *, limit_m: float = np.inf, **settings: Any
     ) -> NDArray[np.int64]:
         """Outcomes on terrains, (num_terrains, 4), of 20 episodes each unless ``settings`` of Crosser.cross differ."""
-        settings = {"replicas": EPISODES, **settings, "invalid_ok": True, "label": self.step + label}
+        settings = {"replicas": faults.EPISODES, **settings, "invalid_ok": True, "label": self.step + label}
         return count_outcomes(self.crosser.cross(policy, terrains, **settings), limit_m)
 
 
@@ -114,7 +106,7 @@ def cross_fresh(archive: Archive, judging: Judging) -> Archive:
     search = judging.search
     terrains = judging.elite_terrains(archive, slice(None), Stream.FRESH)
     label = f"{judging.step}fresh episodes"
-    result = judging.crosser.cross(search.policy, terrains, replicas=FRESH_EPISODES, label=label)
+    result = judging.crosser.cross(search.policy, terrains, replicas=faults.FRESH_EPISODES, label=label)
     corrected = archive.corrected_by(fresh_values(archive, result, search.cfg.fitness))
     if not np.array_equal(archive.cell, corrected.cell):
         print(f"Elites of {search.run} are numbered anew: by their fresh episodes, the hardest first.", flush=True)
@@ -199,7 +191,7 @@ def cross_steered(archive: Archive, judging: Judging) -> Archive:
         print("There is no terrain left for which to seek a way.", flush=True)
         return replace(archive, witnesses=archive.witnesses or no_witnesses(len(archive), LINE_M))
     crossed = {*zip(archive.certifiers, archive.certifier_sha256, strict=True)}
-    walkers = {SEARCHED: search.policy}
+    walkers = {faults.SEARCHED: search.policy}
     walkers |= {name: f for name, f in judging.certifiers.items() if (name, controller_hash(f)) in crossed}
     cfg = SteerCfg()
     terrains = judging.elite_terrains(archive, rows, Stream.STEERED)
@@ -222,8 +214,8 @@ def cross_steered(archive: Archive, judging: Judging) -> Archive:
 def _check_faults(archive: Archive, judging: Judging, before: Collection[str], name: str, *certifying: str) -> None:
     """Refuses a search without faults by the stages ``certifying``, and certifiers that are not at hand."""
     certified = archive.certified if "steered" in certifying else archive.certified_by_controllers
-    faults = certified & (archive.confirmed | ("resolved" in before))
-    if {*certifying}.isdisjoint(before) and ("fresh" in before or not faults.any()):
+    found = certified & (archive.confirmed | ("resolved" in before))
+    if {*certifying}.isdisjoint(before) and ("fresh" in before or not found.any()):
         rule = f"stages must have {' or '.join(certifying)} before {name}"
         raise ValueError(f"{rule}: {judging.search.run} has no faults that it can cross")
     _check_certifiers(archive, judging, steered="steered" in certifying, renewed="others" in before)
@@ -236,7 +228,7 @@ def _check_certifiers(archive: Archive, judging: Judging, *, steered: bool = Fal
     if archive.witnesses is not None and steered:
         certify |= {*archive.witnesses.walker[archive.is_fault & ~archive.certified_by_controllers].tolist()}
     stored = dict(zip(archive.certifiers, archive.certifier_sha256, strict=True))
-    names = [name for name in sorted(certify - {SEARCHED}) if hashes.get(name) != stored.get(name, "")]
+    names = [name for name in sorted(certify - {faults.SEARCHED}) if hashes.get(name) != stored.get(name, "")]
     if lost := [name for name in names if not (renewed and name in hashes)]:
         rule = f"certifiers must be those that certify faults of {judging.search.run}"
         remedy = "give the files by --certifiers, or other controllers of these names and the stage others, too"
@@ -270,14 +262,14 @@ def cross_varied(archive: Archive, judging: Judging) -> Archive:
     search = judging.search
     rows = np.flatnonzero(archive.confirmed & archive.certified_by_controllers)
     space = varied_space(search.space)
-    seeds = elite_seeds(archive, search.cfg.seed, EPISODES, stream=Stream.VARIED).reshape(-1, EPISODES)
+    seeds = elite_seeds(archive, search.cfg.seed, faults.EPISODES, stream=Stream.VARIED).reshape(-1, faults.EPISODES)
 
     def cross(policy: str, rows: NDArray[np.int64], label: str) -> NDArray[np.int64]:
         genes = [varied_genes(search.space, archive.genes[row], seeds[row]) for row in rows]
         drawn = np.array(genes, np.float32).reshape(-1, space.num_genes)
         terrains = Terrains(genes=drawn, seeds=seeds[rows].ravel(), space=space)
         outcomes = judging.count(policy, terrains, f"{label}, varied conditions", replicas=1)
-        return outcomes.reshape(-1, EPISODES, len(OUTCOMES)).sum(axis=1)
+        return outcomes.reshape(-1, faults.EPISODES, len(OUTCOMES)).sum(axis=1)
 
     searched = np.zeros_like(archive.resolved_outcomes)
     searched[rows] = cross(search.policy, rows, "searched")
@@ -320,12 +312,12 @@ def cross_in_mujoco_c(archive: Archive, judging: Judging) -> Archive:
     failing = rows[goal_rates(searched[rows]) < FAILING_GOAL_RATE]
     asked = np.zeros_like(archive.certificates)
     for row in failing.tolist():
-        asked[row] = [name == best_certifier(archive, row) for name in archive.certifiers]
+        asked[row] = [name == faults.best_certifier(archive, row) for name in archive.certifiers]
     certifiers = _cross_by_certifiers(archive, judging, asked, cross)
     steered = np.zeros_like(searched)
     if (witnesses := archive.witnesses) is not None:
         failing = failing[~archive.certified_by_controllers[failing]]
-        walkers = {SEARCHED: search.policy, **judging.certifiers}
+        walkers = {faults.SEARCHED: search.policy, **judging.certifiers}
         for name in np.unique(witnesses.walker[failing]).tolist():
             rows_of = failing[witnesses.walker[failing] == name]
             ways, limit_m = witnesses.way[rows_of], witnesses.limit_m
@@ -413,12 +405,12 @@ def _write(archive: Archive, judging: Judging, stage: str, wall_s: float) -> Non
     assert archive.fresh is not None
     file = run.path / SUMMARY_FILE
     numbers = read_json(file) if file.exists() else {}
-    numbers = {name: value for name, value in numbers.items() if name not in FURTHER_NUMBERS}
+    numbers = {name: value for name, value in numbers.items() if name not in faults.FURTHER_NUMBERS}
     metrics = run.read_metrics() if (run.path / METRICS_FILE).exists() else []
     if len(metrics) >= archive.iterations:  # a search that was stopped has not written its numbers
-        numbers |= found_numbers(archive, metrics[: archive.iterations])
+        numbers |= faults.found_numbers(archive, metrics[: archive.iterations])
     search = judging.search
-    numbers |= fresh_numbers(archive, archive.fresh)
+    numbers |= faults.fresh_numbers(archive, archive.fresh)
     numbers |= judged_numbers(archive, search.space, search.cfg.fitness.disturbances)
     numbers["judged_by"] = numbers.get("judged_by", {}) | {stage: judging.origin | {"wall_s": wall_s}}
     write_archive(run.path, archive)

@@ -16,20 +16,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.faults import numbers as faults
 from qd.faults.causes import find_effects
 from qd.faults.families import VERDICTS, find_verdicts
 from qd.faults.judge import STAGES, Judging, elite_seeds, open_judging
-from qd.faults.numbers import (
-    EPISODES,
-    FRESH_EPISODES,
-    MINIMAL_FILE,
-    MINIMAL_NUMBERS_FILE,
-    MinimalTerrains,
-    fresh_counts,
-    judgement,
-    rate_numbers,
-    read_minimal,
-)
 from qd.faults.searches import Search, find_search
 from qd.search.archive import OUTCOMES, Archive, goal_rates, no_outcomes
 from qd.search.fitness import FAILING_GOAL_RATE
@@ -64,7 +54,7 @@ class Trial(NamedTuple):
     @property
     def rows(self) -> int:
         """Rows of genes that its episodes take."""
-        return (FRESH_EPISODES if self.fresh else EPISODES) // _ROW_EPISODES
+        return (faults.FRESH_EPISODES if self.fresh else faults.EPISODES) // _ROW_EPISODES
 
 
 @dataclass(kw_only=True)
@@ -224,7 +214,7 @@ def open_case(
         how=how or ("exhaustive" if on_gpu and len(parts) <= MAX_PARTS else "greedy"),
         flat=tuple(part for part in parts if not scalable or np.abs(effects.heights[part]).max() <= _LEAST_EFFECT_M),
         later=space.moments(genes),
-        counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
+        counts={Trial(tuple(parts), fresh=True): faults.fresh_counts(archive, number)},
     )
 
 
@@ -264,7 +254,7 @@ def minimise(
     robot: str | None = None,
     policy: str | None = None,
     space: str | None = None,
-) -> MinimalTerrains | None:
+) -> faults.MinimalTerrains | None:
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
     Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first. With
@@ -286,11 +276,11 @@ def minimise(
             print(f"{run}: none of {len(archive):,} elites fails.")
         verdicts = [VERDICTS[verdict] for verdict in find_verdicts(elites)]
         entries = {
-            n: _entry(archive, n, cases[n], search) | {"verdict": verdicts[row], **judgement(elites, row)}
+            n: _entry(archive, n, cases[n], search) | {"verdict": verdicts[row], **faults.judgement(elites, row)}
             for row, n in enumerate(numbers)
         }
         genes = dict(zip(numbers, elites.genes, strict=True))
-        if stored := read_minimal(run, archive):
+        if stored := faults.read_minimal(run, archive):
             entries = {entry["elite"]: entry for entry in stored.numbers["elites"]} | entries
             genes = stored.genes | genes
         if not entries:
@@ -299,13 +289,13 @@ def minimise(
     for number in numbers:
         verdict = f"; {entries[number]['verdict']}" if judged else ""
         print(f"Elite {number}: {result.describe(number)}{verdict}.")
-    print(f"Numbers: {run / MINIMAL_NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
+    print(f"Numbers: {run / faults.MINIMAL_NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
     return result
 
 
 def _write(
     judging: Judging, entries: Mapping[int, dict[str, Any]], genes: Mapping[int, NDArray[np.float32]]
-) -> MinimalTerrains:
+) -> faults.MinimalTerrains:
     search = judging.search
     ordered = [entries[number] for number in sorted(entries)]
     genes = {number: genes[number] for number in sorted(entries)}
@@ -313,10 +303,10 @@ def _write(
     content = {**judging.origin, **space, **_totals(ordered), "elites": ordered}
     arrays = {name: np.array(value) for name, value in space.items() if value is not None}
     arrays |= {"elite": np.array([*genes]), "genes": np.array([*genes.values()])}
-    write_atomically(search.run / MINIMAL_FILE, npz_bytes(arrays))
-    write_atomically(search.run / MINIMAL_NUMBERS_FILE, to_json(content))
+    write_atomically(search.run / faults.MINIMAL_FILE, npz_bytes(arrays))
+    write_atomically(search.run / faults.MINIMAL_NUMBERS_FILE, to_json(content))
     save_figure(search.run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, search.space))
-    return MinimalTerrains(numbers=content, genes=genes)
+    return faults.MinimalTerrains(numbers=content, genes=genes)
 
 
 def _choose_failing(archive: Archive, elite: str | None, search: Search, *, max_elites: int) -> list[int]:
@@ -361,7 +351,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
     shapes = {part: effects.shape(index, search.robot.half_width) for index, part in enumerate(case.minimal)}
     cause = case.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
     whole, scaled = make_heights(np.array(genes), space)
-    without = {str(part): rate_numbers(counts) for part, counts in case.without.items()}
+    without = {str(part): faults.rate_numbers(counts) for part, counts in case.without.items()}
     subsets = {trial.parts for trial in case.counts if trial.scale == 1.0 and trial.parts != case.whole}
     scaled_counts = {trial.scale: counts for trial, counts in case.counts.items() if trial.scale < 1.0}
     return {
@@ -373,7 +363,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
         "of": len(case.parts),
         "how": case.how,
         "subsets_crossed": len(subsets),
-        **rate_numbers(case.fresh),
+        **faults.rate_numbers(case.fresh),
         "without": {part: rate["goal_rate"] for part, rate in without.items()},
         "without_intervals": {part: rate["goal_interval"] for part, rate in without.items()},
         "cause": None if cause is None else {"bump": cause, **asdict(shapes[cause])},
@@ -381,7 +371,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
         "passing_scale": case.passing_scale,
         "height_m": round(float(np.abs(whole).max()), 4),
         "margin_m": None if case.scale is None else round(float(np.abs(whole - scaled).max()), 4),
-        "scales": [{"scale": scale, **rate_numbers(scaled_counts[scale])} for scale in sorted(scaled_counts)],
+        "scales": [{"scale": scale, **faults.rate_numbers(scaled_counts[scale])} for scale in sorted(scaled_counts)],
     }
 
 

@@ -208,12 +208,10 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
     witness = describe_witness(archive, number)
     if not rates and not witness:
         return []
-    known: dict[str, Any] = {"rates": rates, "witness": witness, "success": SUCCESS[archive.terrain_space.asks]}
-    known["passers"] = [*compress(archive.certifiers, archive.certificates[number].tolist())]
-    known |= {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
-    known["in_mujoco_c"] = archive.mujoco_c is not None and archive.mujoco_c.searched[number].any()
-    known["on_line"] = archive.witnesses is not None and archive.witnesses.on_line[number]
-    return TEMPLATES.get_template("elite.txt").render(known).splitlines()
+    passers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
+    about = {"archive": archive, "number": number, "success": SUCCESS[archive.terrain_space.asks]}
+    text = TEMPLATES.get_template("elite.txt").render(about, rates=rates, witness=witness, passers=passers)
+    return text.splitlines()
 
 
 def describe_witness(archive: Archive, number: int) -> str:
