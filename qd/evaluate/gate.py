@@ -240,16 +240,7 @@ def run_gate(
 
 def reason(check: Mapping[str, Any]) -> str:
     """Why a check passes or fails, in a line."""
-    parts = []
-    for kind, test in check["tests"].items():
-        limit, margin = (check["settings"][key] for key in ("limit", "margin"))
-        if kind == "rate":
-            asked = f"goal rate {test['goals'] / max(1, test['episodes']):.3f}, asked for {limit:g}"
-        else:
-            asked = f"{test['lost']} episodes lost, {test['won']} won against old, worse by {margin:g} is too much"
-        rounds = f"{test['rounds']} round{'s' * (test['rounds'] > 1)}"
-        parts.append(f"{asked}: {test['stopped']}, {rounds} of {check['terrains']} episodes")
-    return "; ".join(parts)
+    return _TEMPLATES.get_template("reason.txt").render(check)
 
 
 def to_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, float]]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from qd.evaluate.evaluate import cross_sets, crossings_folder, fill_sizes
 from qd.evaluate.labels import MEASURES, RATES, SetsCfg
 from qd.evaluate.sets import TerrainSet, draw_seeds, elites_sha256, hash_elites, read_trained_on, set_rng
-from qd.evaluate.tables import rate_cells, show_table, terrain_rates, valid_interval, valid_mean
+from qd.evaluate.tables import measure_bounds, rate_cells, show_table, terrain_rates, valid_interval, valid_mean
 from qd.faults.families import VERDICTS, find_families, find_verdicts, kin_distances, rank
 from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers, read_minimal
 from qd.faults.searches import Search, find_certifiers
@@ -31,7 +31,6 @@ from qd.workers.compute import Compute, check_policy
 from sim.controllers.spec import controller_identity, crosser_name, describe_controllers, is_same_controller
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
-from sim.files.intervals import RATES as RATE_BOUNDS
 from sim.files.intervals import wilson_interval
 from sim.files.npz import npz_bytes, read_arrays
 from sim.rates import counted_episodes
@@ -205,7 +204,7 @@ def summarise_rates(entries: Sequence[Entry], controller: str, seed: int) -> dic
     for name in RATES:
         values = _read_rates(entries, controller, name)
         summary[f"{name}_rate"] = valid_mean(values)
-        summary[f"{name}_interval"] = valid_interval(values, seed, families, RATE_BOUNDS)
+        summary[f"{name}_interval"] = valid_interval(values, seed, families, measure_bounds(name))
     goal = _read_rates(entries, controller, "goal")
     failing = goal < FAILING_GOAL_RATE
     valid = ~np.isnan(goal)

@@ -311,7 +311,7 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
         what = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"{rule}: {what}: remove both, or run `faultline minimise` again") from None
     # A search that went on may have found others of these numbers.
-    names = {*zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True)}
+    names = [*zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True)]
     named = [(entry["elite"], entry["cell"], entry["iteration"]) in names for entry in entries]
     numbers["elites"] = [*compress(entries, named)]
     genes_by_elite = {entry["elite"]: row for entry, row in zip(numbers["elites"], genes[named], strict=True)}
