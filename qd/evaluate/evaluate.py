@@ -123,7 +123,7 @@ def evaluate_tables(
     origin: dict[str, Any] = {"archive": None, "archive_sha256": None, "independent": None}
     if cfg.archive is not None:
         archive = read_robot_archive(robot, cfg.archive, cfg.space)
-        sizes = {name: len(rows) for name, rows in vars(terrain_sets.split_elites(archive)).items()}
+        sizes = {name: len(rows) for name, rows in terrain_sets.split_elites(archive)._asdict().items()}
         origin["archive"] = _describe_archive(cfg.archive, archive) | sizes
         origin["archive_sha256"] = origin["archive"].pop("sha256")
     if cfg.independent is not None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,7 @@ _NAMES = ("hand_crafted", "hard_random", "flat", "generated", "pack", INDEPENDEN
 _BANK = 50  # height maps that are compared at once
 
 
-@dataclass(frozen=True, kw_only=True)
-class EliteSplit:
+class EliteSplit(NamedTuple):
     """Elites to train on and elites held out, as rows of the archive in the order drawn; the three are disjoint."""
 
     train: NDArray[np.int64]

@@ -1,7 +1,7 @@
 """The shape of a part of a terrain, as a robot that walks straight to the goal meets it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -51,14 +51,14 @@ class Shape:
     """How a robot meets a part that lies alone on flat ground. Slopes are those of its steepest place."""
 
     kind: str  # one of SHAPES, SLIPPERY, SOFT, or the cause of a condition; docs/faults.md has limits
-    height_m: float  # height under the robot where it is largest, negative of a hollow [m]
-    slope_deg: float  # steepest slope under the robot [degrees]
-    along_deg: float  # slope along the way, negative where the ground falls [degrees]
-    across_deg: float  # slope across the way [degrees]
-    oblique_deg: float  # angle between the way and the direction of the steepest rise or fall, 0 to 90 [degrees]
-    length_m: float  # length over which it has at least half of that height, along the way through that place [m]
-    left_m: float  # how far left of the way it has that height, within 1 m along the way of that place [m]
-    right_m: float  # how far right of the way [m]; negative where it lies to the left alone
+    height_m: float = 0.0  # height under the robot where it is largest, negative of a hollow [m]
+    slope_deg: float = 0.0  # steepest slope under the robot [degrees]
+    along_deg: float = 0.0  # slope along the way, negative where the ground falls [degrees]
+    across_deg: float = 0.0  # slope across the way [degrees]
+    oblique_deg: float = 0.0  # angle between the way and the steepest rise or fall, 0 to 90 [degrees]
+    length_m: float = 0.0  # length of the way over which it has at least half of that height, through that place [m]
+    left_m: float = 0.0  # how far left of the way it has that height, within 1 m along the way of that place [m]
+    right_m: float = 0.0  # how far right of the way [m]; negative where it lies to the left alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,17 +95,14 @@ class Effects:
         kind = CONDITIONS[name].cause if name else None
         if kind is None and self.patches[part].any() and self.way(part, half_width)[0] < _LEAST_HEIGHT:
             kind = SLIPPERY if self.slippery[part].any() else SOFT
-        if kind is None:
-            return measure_shape(self.heights[part], half_width)
-        return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
+        return Shape(kind=kind) if kind else measure_shape(self.heights[part], half_width)
 
 
 def describe_cause(cause: Mapping[str, Any] | None) -> str:
     """A cause with the values of its :class:`Shape`: ``ridge, 0.25 m high, 53 degrees steep``."""
     if cause is None:
         return UNCLEAR
-    kind = cause["kind"]
-    height = cause.get("height_m")
+    kind, height = cause["kind"], cause.get("height_m")
     if not height:
         return kind
     size = SHAPES[kind] or ("high" if height > 0.0 else "deep")
@@ -144,7 +141,6 @@ def find_causes(
     It is the part which, alone on flat ground, has the largest difference of heights near that place; where that is
     under 3 cm, slippery or soft ground. How near was chosen on half of the elites in results/ with minimal terrains. Of
     the others it names the cause's kind in six of ten, in seven if oblique counts as straight; a random part in three.
-
     Genes have shape (N, num_genes), ``ends`` are world-local x and y [m], (N, 2), NaN where they are not known.
     """
     return [_find_cause(*terrain, space, half_width) for terrain in zip(genes, ends, strict=True)]

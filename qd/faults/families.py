@@ -1,7 +1,7 @@
 """The elites of an archive by what is known best of each, in groups and in orders to show them in.
 
-Kin are terrains so much alike that they are not independent of each other. Families are kin of kin; distinct terrains
-are no kin of one another. A cause groups failing elites on which parts of one kind stop the robot, such as ridges.
+Kin are terrains so much alike that they are not independent. Families are kin of kin; distinct terrains are no kin. A
+cause groups failing elites on which parts of one kind stop the robot, such as ridges.
 """
 
 from collections.abc import Mapping, Sequence

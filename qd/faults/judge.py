@@ -140,10 +140,9 @@ def cross_resolved(archive: Archive, judging: Judging) -> Archive:
 
 
 def cross_by_others(archive: Archive, judging: Judging) -> Archive:
-    """Lets certifiers cross the failing elites in 20 episodes, at the search's settings and with contact resolved.
+    """Lets certifiers cross the failing elites in 20 episodes, and where they cross half with contact resolved, too.
 
-    Where a certifier crosses less than half of the time at the search's settings, it cannot certify, and does not cross
-    with contact resolved. Outcomes of certifiers not asked stay; another controller of the name replaces them.
+    Outcomes of certifiers not asked stay; another controller of the name replaces them.
     """
     rows = np.flatnonzero(archive.failing)
     for name, policy in judging.certifiers.items():

@@ -33,6 +33,7 @@ from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.terrains import Terrains
 
+FIGURE_FILE = "minimal.png"
 MAX_PARTS = 10  # parts of a terrain whose subsets, 1,024 at most, are all crossed if need be
 _MOMENTS = 8  # at equal distances, from which the latest of a push is chosen
 _SCALE_STEPS = 5  # halvings of the interval that holds the least scale which still fails: it is known to 1/32
@@ -240,9 +241,6 @@ def take_apart(archive: Archive, cases: Mapping[int, Case], judging: Judging) ->
             cases[number].counts[trial] = counts.sum(axis=0)
 
 
-FIGURE_FILE = "minimal.png"
-
-
 def minimise(
     run: Path,
     *,
@@ -293,12 +291,10 @@ def minimise(
     return result
 
 
-def _write(
-    judging: Judging, entries: Mapping[int, dict[str, Any]], genes: Mapping[int, NDArray[np.float32]]
-) -> faults.MinimalTerrains:
+def _write(judging: Judging, entries: dict[int, dict[str, Any]], genes: dict[int, Any]) -> faults.MinimalTerrains:
     search = judging.search
-    ordered = [entries[number] for number in sorted(entries)]
     genes = {number: genes[number] for number in sorted(entries)}
+    ordered = [entries[number] for number in genes]
     space = {"space": search.cfg.space, "space_sha256": search.cfg.space_sha256}
     content = {**judging.origin, **space, **_totals(ordered), "elites": ordered}
     arrays = {name: np.array(value) for name, value in space.items() if value is not None}

@@ -55,13 +55,12 @@ class SteerCfg:
 
 def seek_witnesses(
     crosser: Crosser, walkers: Mapping[str, str], terrains: Terrains, seeds: NDArray[np.uint32], limit_m: float, *,
-    rng: np.random.Generator, label: str = "", cfg: SteerCfg | None = None,
+    rng: np.random.Generator, cfg: SteerCfg, label: str = "",
 ) -> Witnesses:  # fmt: skip
     """Witnesses of T terrains: each of the walkers, controllers by name, tries those that have none on the line yet.
 
     A walker first looks for a way on the line, then for any. ``seeds`` have the shape (T, walkers * cfg.seeds).
     """
-    cfg = cfg or SteerCfg()
     count, generations = len(terrains), cfg.generations
     best = no_witnesses(count, limit_m)
     for index, (name, policy) in enumerate(walkers.items()):
@@ -192,9 +191,8 @@ def cross_half(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
 def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """The kind of witness that each of T ways is, as its index in :data:`WITNESSES`, shape (T,).
 
-    ``counts`` are those of ``Witnesses.counts``. A way is a witness if it leads at least half of the episodes to the
-    goal, and more than the plain command does, with both physics (Fisher's exact test; Benjamini and Hochberg 1995).
-    No more than a quarter of the episodes of either may be invalid.
+    A way is a witness if it leads at least half of the episodes to the goal, and more than the plain command does, with
+    both physics (Fisher's exact test; Benjamini and Hochberg 1995). Too many invalid episodes say nothing.
     """
     kinds = np.zeros(len(counts), np.int64)
     goals_plain, valid_plain = counts[:, :, 0, 2], counts[:, :, 0, 3]
