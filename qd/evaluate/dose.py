@@ -115,9 +115,8 @@ def all_doses() -> dict[str, Dose]:
     doses = dict[str, Dose]()
     for element in ELEMENTS.values():
         for name, sweep in element.doses.items():
-            make = partial(element.lay_alone, sweep.turn)
             titled: dict[str, Any] = {**vars(sweep), "title": name.replace("_", " ")}
-            doses[name] = Dose(**titled, quantities=element.quantities, make=make)
+            doses[name] = Dose(**titled, quantities=element.quantities, make=partial(element.lay_alone, sweep.turn))
     for quantity, values in _GROUNDS:
         sweep = Sweep(quantity.name, values, title="level ground")
         doses[quantity.name] = _dose_level(quantity.name, sweep, quantity, ground_genes)

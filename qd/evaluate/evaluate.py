@@ -182,10 +182,8 @@ def evaluate_rates(
     controller = crosser_name(robot, policy)
 
     def make_report() -> dict[str, Any]:
-        cache = crossings_folder(robot)
-        policies = {controller: policy}
-        since: dict[str, Any] = {"penalties_from_s": tables.VELOCITY_FROM_S}
-        results = cross_sets(policies, sets, robot, compute, episodes, cache=cache, **since)
+        settings: Any = {"penalties_from_s": tables.VELOCITY_FROM_S, "cache": crossings_folder(robot)}
+        results = cross_sets({controller: policy}, sets, robot, compute, episodes, **settings)
         hand_crafted, hard_random, flat = (results[name][controller] for name in sets)
         types, levels = sets["hand_crafted"].types, sets["hand_crafted"].levels
         return {

@@ -394,8 +394,7 @@ def find_candidates(searches: Sequence[Search], archives: Sequence[Archive]) -> 
         assert archive.fresh is not None
         near.append(np.flatnonzero(archive.fresh.valid & (archive.fresh.goal_rate < NEAR_GOAL_RATE)))
     of_all = np.concatenate([archive.genes[rows] for archive, rows in zip(archives, near, strict=True)])
-    families = find_families(of_all, searches[0].space)
-    by_run = np.split(families, np.cumsum([len(rows) for rows in near])[:-1])
+    by_run = np.split(find_families(of_all, searches[0].space), np.cumsum([len(rows) for rows in near])[:-1])
     candidates, not_passable = dict[tuple[str, str], Candidate](), 0
     for run, (search, archive, rows, own) in enumerate(zip(searches, archives, near, by_run, strict=True)):
         of_run = {"run": run} if len(searches) > 1 else {}
@@ -412,8 +411,7 @@ def _candidates_of(
     """Those of one run, None where nobody crosses; ``families`` are by elite, and entries have ``of_run``, too."""
     assert archive.fresh is not None
     minima, rate, witnesses = read_minimal(search.run, archive), archive.fresh.goal_rate, archive.witnesses
-    half_width = search.robot.half_width
-    causes = rank(archive, search.space, minima, half_width=half_width).causes if families else ()
+    causes = rank(archive, search.space, minima, half_width=search.robot.half_width).causes if families else ()
     marks, verdicts = hash_elites(archive.genes), find_verdicts(archive)
     prefix = "".join(f"run-{number}-" for number in of_run.values())
 

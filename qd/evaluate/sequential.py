@@ -67,8 +67,7 @@ def rate_interval(goals: int, episodes: int, level: float = 0.95) -> list[float]
     rates = np.sort(np.append(np.linspace(0.0005, 0.9995, 1000), np.clip(rate, 1e-6, 1.0 - 1e-6)))
     wealth = _log_mixture(goals, misses) - goals * np.log(rates) - misses * np.log1p(-rates)
     kept = np.flatnonzero(wealth < -np.log(1.0 - level))
-    ends = np.concatenate([[0.0], rates, [1.0]])[[kept[0], kept[-1] + 2]]  # a step outward
-    return ends.tolist()
+    return np.concatenate([[0.0], rates, [1.0]])[[kept[0], kept[-1] + 2]].tolist()  # a step outward
 
 
 class PairedTest:

@@ -222,8 +222,7 @@ def make_sets(
         if "generated_far" in names:
             training_genes = archive.genes[split_elites(archive).train]
             distance = nearest_distance(whole.terrains.values, training_genes, whole.terrains.space)
-            third = np.sort(np.argsort(-distance, kind="stable")[: -(-len(whole) // 3)])
-            sets["generated_far"] = whole.rows(third)
+            sets["generated_far"] = whole.rows(np.sort(np.argsort(-distance, kind="stable")[: -(-len(whole) // 3)]))
     if independent is not None and INDEPENDENT in names:
         sets[INDEPENDENT] = random_elites(INDEPENDENT, independent, count, seed)
     return {name: sets[name] for name in SETS if name in names}

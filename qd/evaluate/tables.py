@@ -146,11 +146,6 @@ def summarise_crossings(
     def summarise(mask: NDArray[np.bool_]) -> dict[str, Any]:
         return {"terrains": int(mask.sum())} | {name: valid_mean(values[mask]) for name, values in rates.items()}
 
-    by_type = by_level = None
-    if types is not None:
-        by_type = {CROSSING_TYPES[k]: summarise(types == k) for k in np.unique(types)}
-    if levels is not None:
-        by_level = {str(level): summarise(levels == level) for level in np.unique(levels)}
     counts = {outcome: int((result.outcome == outcome).sum()) for outcome in Outcome}
     return {
         **summarise(np.ones(len(result.outcome), bool)),
@@ -158,8 +153,8 @@ def summarise_crossings(
         "episodes": int(result.outcome.size),
         "outcomes": {end.name.lower(): count for end, count in counts.items() if count or end < Outcome.TILT},
         "invalid_terrains": int(np.isnan(rates["success_rate"]).sum()),
-        "by_type": by_type,
-        "by_level": by_level,
+        "by_type": None if types is None else {CROSSING_TYPES[k]: summarise(types == k) for k in np.unique(types)},
+        "by_level": None if levels is None else {str(k): summarise(levels == k) for k in np.unique(levels)},
     }
 
 

@@ -196,16 +196,14 @@ def measure_shape(field: NDArray[np.float32], half_width: float) -> Shape:
     window = heights[:, max(first - near, 0) : first + near + 1]
     low = (window * np.sign(height) < abs(height) / 2).all(axis=1)
     low = np.pad(low, 1, constant_values=True)  # the grid's edge ends it
-    left = middle + int(low[middle + 1 :].argmax())
-    right = middle - int(low[middle + 1 :: -1].argmax())
     slopes = {"slope_deg": steepness, "along_deg": along, "across_deg": across}
     numbers = {
         "height_m": height,
         **{name: float(np.rad2deg(np.arctan(float(values[steepest])))) for name, values in slopes.items()},
         "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[steepest]), abs(along[steepest])))),
         "length_m": SPACING * int((np.abs(ground[:, row]) >= abs(height) / 2).sum()) if height else 0.0,
-        "left_m": SPACING * (left - _CENTRE),
-        "right_m": SPACING * (_CENTRE - right),
+        "left_m": SPACING * (middle + int(low[middle + 1 :].argmax()) - _CENTRE),
+        "right_m": SPACING * (_CENTRE - middle + int(low[middle + 1 :: -1].argmax())),
     }
     return Shape(kind=_classify(numbers), **{name: round(value, 3) for name, value in numbers.items()})
 

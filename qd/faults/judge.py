@@ -272,8 +272,7 @@ def cross_varied(archive: Archive, judging: Judging) -> Archive:
 
     searched = np.zeros_like(archive.resolved_outcomes)
     searched[rows] = cross(search.policy, rows, "searched")
-    asked = archive.certificates & archive.confirmed[:, None]
-    certifiers = _cross_by_certifiers(archive, judging, asked, cross)
+    certifiers = _cross_by_certifiers(archive, judging, archive.certificates & archive.confirmed[:, None], cross)
     archive = replace(archive, varied=CrossedAgain(searched=searched, certifiers=certifiers))
     print(f"{archive.robust.sum()} of {len(rows)} faults are robust: faults under varied conditions, too.", flush=True)
     return archive

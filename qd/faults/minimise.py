@@ -378,7 +378,6 @@ def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     causes = Counter(entry["cause"]["kind"] for entry in entries if entry["cause"])
     verdicts = Counter(entry["verdict"] for entry in entries)
     judged = any(entry["resolved"] for entry in entries)
-    certifiers = {certificate["controller"] for entry in entries for certificate in entry["certificates"]}
     return {
         "minimal": len(entries),
         "bumps_histogram": {str(size): count for size, count in sorted(Counter(sizes).items())},
@@ -388,5 +387,5 @@ def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "confirmed": verdicts["confirmed"] + verdicts["fault"] if judged else None,
         "certified": verdicts["certified"] + verdicts["fault"] if judged else None,
         "faults": verdicts["fault"] if judged else None,
-        "certifiers": sorted(certifiers),
+        "certifiers": sorted({row["controller"] for entry in entries for row in entry["certificates"]}),
     }

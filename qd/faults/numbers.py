@@ -210,8 +210,8 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
         return []
     passers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
     about = {"archive": archive, "number": number, "success": SUCCESS[archive.terrain_space.asks]}
-    text = TEMPLATES.get_template("elite.txt").render(about, rates=rates, witness=witness, passers=passers)
-    return text.splitlines()
+    about |= {"rates": rates, "witness": witness, "passers": passers}
+    return TEMPLATES.get_template("elite.txt").render(about).splitlines()
 
 
 def describe_witness(archive: Archive, number: int) -> str:

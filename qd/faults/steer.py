@@ -199,8 +199,7 @@ def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     valid, crossed = counts[:, :, 1, 3], cross_half(counts[:, :, 1])
     known = (counts[..., 3] >= (1.0 - MAX_INVALID_SHARE) * EPISODES).all(axis=(1, 2))
     for kind, column in ((1, 2), (2, 1), (3, 0)):
-        goals = counts[:, :, 1, column]
-        p = fisher_p(goals, valid, goals_plain, valid_plain).max(axis=1)
+        p = fisher_p(counts[:, :, 1, column], valid, goals_plain, valid_plain).max(axis=1)
         crosses = known & crossed[..., column].all(axis=1)
         lucky = false_discovery_control(np.clip(p, 0.0, 1.0)) > MAX_FALSE_DISCOVERIES
         kinds[crosses & ~lucky] = kind
