@@ -87,10 +87,7 @@ class Dose(Sweep):
         return replace(self, values=tuple(values), others={**self.others, **changed})
 
     def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-        """Terrains, first one of each value, then the next of each: heights [m], (count * num_values, ...), or genes.
-
-        An obstacle begins at ``count`` nodes that are spread evenly over 1 m; all else is the same for all values.
-        """
+        """Heights [m] or genes, one of each value, then the next of each; obstacles begin at nodes spread over 1 m."""
         return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
 
 
@@ -164,10 +161,7 @@ def measure_dose(
     seed: int = 0,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Lets every controller cross every value of every dose; prints, writes and draws the rates.
-
-    Without sizes there are as many ``terrains`` (a value) and ``episodes`` (a terrain) as suit the device.
-    """
+    """Lets controllers cross all values of doses, of sizes that suit the device; prints, writes and draws the rates."""
     count, episodes = fill_sizes(compute, terrains, episodes, **_SIZES)
     conditions = [name for name in doses if name in CONDITIONS]
     if any(CONDITIONS[name].asks == Kind.ROUTE for name in conditions):

@@ -105,10 +105,7 @@ def evaluate(
 def evaluate_tables(
     robot: RobotCfg, controllers: Mapping[str, str], cfg: SetsCfg, *, compute: Compute, out: Path | None = None
 ) -> dict[str, Any]:
-    """The tables of controllers with where their terrains come from; prints and writes them, by default under runs/.
-
-    Controllers ``old`` and ``new`` are compared on elites that neither was trained on.
-    """
+    """The tables of controllers, ``old`` and ``new`` on elites that neither trained on; prints and writes them."""
     compares = {*controllers} == {"old", "new"}
     if compares:
         if cfg.archive is None:

@@ -1,7 +1,4 @@
-"""A gate for continuous integration and training: does a controller pass what a gate.toml asks of it?
-
-Episodes are crossed in rounds, one of every terrain, until sequential tests are clear (:mod:`qd.evaluate.sequential`).
-"""
+"""A gate for continuous integration and training: does a controller pass a gate.toml, by sequential tests in rounds?"""
 
 import hashlib
 import os
@@ -208,10 +205,7 @@ def run_gate(
     file: Path, cfg: GateCfg, drawn: Sequence[CheckTerrains], robot: RobotCfg, policies: Mapping[str, str],
     compute: Compute,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs the checks of a gate.toml on ``drawn`` terrains, by ``new`` of the policies, against ``old`` if it is there.
-
-    A controller that does not cross level ground fails, and is not asked further. Returns JSON values.
-    """
+    """Runs the checks of a gate.toml on ``new`` of the policies; one that does not cross level ground fails at once."""
     if lone := [check.title for check in cfg.check if check.limit is None and "old" not in policies]:
         rule = "a check without a limit is of old against new"
         raise ValueError(f"{rule}, got {lone[0]} and no old controller: give one")

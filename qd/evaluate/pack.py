@@ -385,9 +385,9 @@ def drop_kin(candidates: Sequence[Candidate], apart_from: Sequence[Archive], sea
 
 
 def find_candidates(searches: Sequence[Search], archives: Sequence[Archive]) -> tuple[list[Candidate], int]:
-    """The faults and near-faults of runs: elites as they are, and minimal terrains that lack some of their parts.
+    """The faults and near-faults of runs, which count once in families over all runs; how many more nobody crosses.
 
-    Families are over all runs; what several runs have counts once. Returns how many more nobody is known to cross, too.
+    They are elites as they are, and minimal terrains that lack some of their parts.
     """
     near: list[NDArray[np.int64]] = []
     for archive in archives:

@@ -87,8 +87,8 @@ def kind_mean(
 
     ``values`` has the measure for each kind, shape (num_trainings, num_terrains). Returns ``mean``, its 95 %
     ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain that is valid for all. The
-    variance is that over families, by the bootstrap, and that over trainings; the interval is Student's with
-    Satterthwaite's degrees of freedom (1946), no narrower than the bootstrap's. One training says nothing of others.
+    interval is Student's, of the variances over families (bootstrap) and over trainings, with Satterthwaite's degrees
+    of freedom (1946), no narrower than the bootstrap's. One training says nothing of others.
     """
     valid = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in values])
     if not valid.any():

@@ -1,7 +1,6 @@
 """Judging: which elites of a search are faults of its controller, stage by stage.
 
-Episodes follow from the run's seed and from what names an elite. Crossings are kept in the run, so that a judging that
-was stopped finds them when it is run again.
+Episodes follow from the run's seed and what names an elite. Crossings are kept in the run, so that judging can go on.
 """
 
 import time
@@ -178,10 +177,7 @@ def _check_steered(archive: Archive, judging: Judging, before: Collection[str]) 
 
 
 def cross_steered(archive: Archive, judging: Judging) -> Archive:
-    """Looks for ways by which the searched controller, or else a certifier, crosses what nobody crosses without.
-
-    Returns the archive with witnesses of its confirmed elites that no controller certifies, at first one a family.
-    """
+    """Looks for ways across confirmed elites that no controller certifies, at first one a family: witnesses."""
     search, crosser = judging.search, judging.crosser
     open_cases = archive.confirmed if archive.resolved_outcomes.any() else archive.failing
     first, others = split_families(archive, np.flatnonzero(open_cases & ~archive.certified_by_controllers))

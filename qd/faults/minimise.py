@@ -256,8 +256,8 @@ def minimise(
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
     Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first. With
-    ``judged`` minimal terrains are crossed with contact resolved and by certifiers; all else is as
-    :func:`qd.faults.judge.judge` takes it. Returns what the run has now; None without a failing elite.
+    ``judged`` minimal terrains are crossed with contact resolved and by certifiers. Returns what the run has now; None
+    without a failing elite.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     with open_judging(search, compute, certifiers, ask=judged) as judging:
