@@ -4,7 +4,7 @@ They hold whatever the terrains' own rates are, and however often one looks:
 
 - *Rate*: wealth that bets on mean goal rates above ``limit - margin``, half of it on ``limit + margin`` and half on all
   by Beta(1/2, 1/2), is a likelihood ratio: at most 1 in expectation over a round whose mean rate is that or less, since
-  a geometric mean is at most an arithmetic one. So it exceeds 1 / error with a chance of at most ``error`` (Ville 1939).
+  a geometric mean is at most an arithmetic one. It exceeds 1 / error with a chance of at most ``error`` (Ville 1939).
   Then, if the rate is above the limit, the controller passes. By bets on rates below ``limit + margin`` it fails.
 - *Old against new*: pairs of equal terrain, seed and replica differ by d = -1, 0 or 1. Wealth that bets a share x on d,
   times 1 + x d, grows beyond 1 / error with a chance of at most ``error`` where the mean of d is not positive (Waudby-
