@@ -345,28 +345,27 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         from qd.evaluate.tables import is_regression
 
         makes_tables = bool(self.policies or self.sets or self.archive or self.independent)
-        size: dict[str, Any] = {"terrains": self.terrains, "episodes": self.episodes, "seed": self.seed}
+        cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         if self.pack is not None:
             if makes_tables or self.space is not None:
                 raise ValueError("--pack goes with --policy alone, got flags of tables or --space too: leave them out")
             pack = read_pack(find_pack(self.pack))
             robot = resolve_robot(pack.content, self.robot, pack.folder / PACK_FILE, kind="pack")
             policy = self.policy or str(robot.policy_file)
-            report = evaluate_pack(pack, robot, policy, compute=_compute(self), out=self.out, **size)
+            report = evaluate_pack(pack, robot, policy, cfg, compute=_compute(self), out=self.out)
             return int(self.fail_under is not None and not passes(report, self.fail_under))
         if self.fail_under is not None:
             raise ValueError("--fail-under goes with --pack: give the pack too")
         robot, compute = get_robot(self.robot), _compute(self)
         if not makes_tables:
             policy = self.policy or str(robot.policy_file)
-            evaluate_rates(robot, policy, compute=compute, space=self.space, out=self.out, **size)
+            evaluate_rates(robot, policy, cfg, compute=compute, out=self.out)
             return 0
         if self.policy is not None:
             remedy = f"give --policies tuned={self.policy} instead of --policy"
             raise ValueError(f"tables are of named controllers: {remedy}")
         controllers = parse_controllers(self.policies, robot)
         robot = ensure_ready(robot, next(iter(controllers.values())), compute, skip_level_ground=True)
-        cfg = replace(select_settings(SetsCfg, self), sets=tuple(split_values(self.sets)))
         return int(is_regression(evaluate_tables(robot, controllers, cfg, compute=compute, out=self.out)))
 
     def _pass_gate(self, file: Path) -> int:
@@ -386,7 +385,7 @@ class EvaluateCommand(SetsCfg, ControllerFlags, WorkerFlags):
         if self.policies and {*controllers} != {"old", "new"}:
             raise ValueError(f"--gate compares --policies old=A new=B, got {', '.join(controllers)}: use these names")
         controllers = controllers or {"new": self.policy or str(robot.policy_file)}
-        report = publish_gate(file, robot, controllers, _compute(self), out=self.out, junit=self.junit)
+        report = publish_gate(file, robot, controllers, _compute(self), self.out, self.junit)
         return int(not report["passes"])
 
 

@@ -11,9 +11,8 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from kernels.super_gaussian import LOWER, UPPER
-from qd.evaluate.measures import Performance, measure
 from qd.evaluate.sets import TerrainSet, plain_set
-from qd.evaluate.tables import Tables, make_tables
+from qd.evaluate.tables import Performance, Tables, make_tables, measure
 from qd.search.archive import Archive, FreshValues, no_outcomes, no_witnesses, write_archive
 from qd.search.fitness import Evaluation
 from sim.files.atomic import to_json

@@ -15,9 +15,8 @@ import numpy as np
 
 from qd.evaluate.evaluate import cross_sets, evaluate, fill_sizes
 from qd.evaluate.level import report_level_ground
-from qd.evaluate.measures import terrain_rates
 from qd.evaluate.sets import MIN_ELITES, Purpose, TerrainSet, generated_set, make_sets, paper_terrains
-from qd.evaluate.tables import show_table
+from qd.evaluate.tables import show_table, terrain_rates
 from qd.faults.judge import judge
 from qd.faults.numbers import EPISODES
 from qd.search.archive import read_archive

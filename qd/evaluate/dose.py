@@ -1,12 +1,13 @@
 """Which real obstacle at which size stops a controller: goal rate against a stair's rise, a ditch's width, friction.
 
-A dose is one obstacle alone on flat ground, or one ground or condition everywhere, of which one number grows. An
-obstacle is an element of a course (:mod:`sim.terrains.elements`) of any size, within the ranges of its space or beyond.
+A dose is one obstacle alone on flat ground, an element of a course of any size (:mod:`sim.terrains.elements`), or one
+ground or condition everywhere, of which one number grows.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,7 @@ from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import ground_genes
 from sim.terrains.terrains import Terrains
 
-_FULL = (20, 4)  # terrains a value and episodes a terrain
-_SMALL = (8, 2)  # on a machine without a GPU
+_SIZES = {"full": (20, 4), "small": (8, 2)}  # terrains a value and episodes a terrain; small without a GPU
 _COLUMNS = 4
 _RESAMPLES = 1000
 _BEYOND = {"first": "before the first", "last": "beyond the last", "invalid": "unknown, episodes are invalid"}
@@ -61,9 +61,7 @@ class Dose(Sweep):
 
     quantities: Mapping[str, Quantity]
     make: Callable[[Mapping[str, Any], int, np.random.Generator], NDArray[np.float32]] = field(compare=False)
-    """Makes the terrains of quantities, of which one has several values (:meth:`terrains`)."""
-    space: str = SUPER_GAUSSIAN.name
-    """Terrain space of its genes; of heights any."""
+    space: str = SUPER_GAUSSIAN.name  # terrain space of its genes; of heights any
 
     def describe(self) -> str:
         """The obstacle and its other quantities: ``stairs up, tread 0.30 m, flight 5 steps``."""
@@ -89,27 +87,19 @@ class Dose(Sweep):
         return replace(self, values=tuple(values), others={**self.others, **changed})
 
     def terrains(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
-        """Terrains of all values, ``count`` each: first one of each value, then the next of each.
-
-        An obstacle begins at ``count`` nodes that are spread evenly over 1 m; all else is the same for all values.
-        Returns heights [m], shape (count * num_values, NUM_ROWS, NUM_COLS), or genes of :attr:`space`.
-        """
+        """Heights [m] or genes, one of each value, then the next of each; obstacles begin at nodes spread over 1 m."""
         return self.make({**self.others, self.parameter: np.array(self.values)}, count, rng)
 
 
 def _dose_level(
     name: str, sweep: Sweep, quantity: Quantity, to_genes: Callable[[Any], NDArray[Any]], height: float = 0.0
 ) -> Dose:
-    """Level ground, whose map or condition has ``to_genes`` of quantities, shape (num_values, number of its genes).
-
-    With a ``height``, in place of level ground there are hard-random terrains of that share of their height.
-    """
+    """Level ground, or hard-random terrains of so much ``height``, with a map or condition of (num_values, G) genes."""
 
     def make(quantities: Mapping[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float32]:
         genes = to_genes({**sweep.others, sweep.parameter: quantities[name]})
-        bumps = np.zeros((count, SUPER_GAUSSIAN.num_genes))  # of no height
-        if height:
-            bumps = SUPER_GAUSSIAN.scaled(SUPER_GAUSSIAN.hard_random(count, rng), height)
+        level = np.zeros((count, SUPER_GAUSSIAN.num_genes))
+        bumps = SUPER_GAUSSIAN.scaled(SUPER_GAUSSIAN.hard_random(count, rng), height) if height else level
         rows = np.repeat(bumps, len(genes), axis=0), np.tile(genes, (count, 1))
         return np.concatenate(rows, axis=1).astype(np.float32)
 
@@ -122,9 +112,8 @@ def all_doses() -> dict[str, Dose]:
     doses = dict[str, Dose]()
     for element in ELEMENTS.values():
         for name, sweep in element.doses.items():
-            make = partial(element.lay_alone, sweep.turn)
             titled: dict[str, Any] = {**vars(sweep), "title": name.replace("_", " ")}
-            doses[name] = Dose(**titled, quantities=element.quantities, make=make)
+            doses[name] = Dose(**titled, quantities=element.quantities, make=partial(element.lay_alone, sweep.turn))
     for quantity, values in _GROUNDS:
         sweep = Sweep(quantity.name, values, title="level ground")
         doses[quantity.name] = _dose_level(quantity.name, sweep, quantity, ground_genes)
@@ -137,16 +126,13 @@ def all_doses() -> dict[str, Dose]:
 
 
 def parse_doses(texts: Sequence[str], at: Sequence[str]) -> dict[str, Dose]:
-    """Some of :func:`all_doses`, in their order, as a command line names them; without ``texts`` all but conditions.
-
-    A text holds words ``stairs_up``, with other values ``ditch=0.2,0.4``; ``at`` are other quantities, ``tread=0.25``.
-    """
+    """Some doses, in their order: ``stairs_up``, or ``ditch=0.2,0.4``; ``at`` has other quantities, ``tread=0.25``."""
     doses, chosen, others = all_doses(), dict[str, Sequence[float] | None](), dict[str, float]()
     word = ""
     try:
         for word in " ".join(texts).split():
             name, equals, values = word.partition("=")
-            chosen[name] = [float(value) for value in values.split(",")] if equals else None
+            chosen[name] = [*map(float, values.split(","))] if equals else None
         for word in " ".join(at).split():
             name, _, value = word.partition("=")
             others[name] = float(value)
@@ -175,12 +161,8 @@ def measure_dose(
     seed: int = 0,
     out: Path | None = None,
 ) -> dict[str, Any]:
-    """Lets every controller cross every value of every dose; prints, writes and draws the rates.
-
-    Without ``terrains`` (a value) and ``episodes`` (a terrain) there are as many as suit the device. Without ``out``
-    the file lies under runs/. The report has ``dose`` (:func:`measure_rates`) and ``half`` (:func:`find_half`).
-    """
-    count, episodes = fill_sizes(compute, terrains, episodes, full=_FULL, small=_SMALL)
+    """Lets controllers cross all values of doses, of sizes that suit the device; prints, writes and draws the rates."""
+    count, episodes = fill_sizes(compute, terrains, episodes, **_SIZES)
     conditions = [name for name in doses if name in CONDITIONS]
     if any(CONDITIONS[name].asks == Kind.ROUTE for name in conditions):
         read_stray(robot, resolved=resolved)  # or refuses
@@ -215,10 +197,7 @@ def measure_dose(
 
 
 def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
-    """The terrains of a dose, those of all values at one place behind each other, so that workers share the hard ones.
-
-    There are ``num_terrains`` a value. The seed draws their episodes, the same ones for all doses.
-    """
+    """Terrains of a dose, all values of one place behind each other: so workers share the hard ones. ``seed`` draws."""
     rng = set_rng("dose", seed)
     seeds = draw_seeds(rng, num_terrains).repeat(len(dose.values))
     values = dose.terrains(num_terrains, rng)
@@ -228,10 +207,7 @@ def dose_set(dose: Dose, num_terrains: int, seed: int) -> TerrainSet:
 
 
 def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult) -> list[dict[str, Any]]:
-    """Rates of one controller on a dose, a row a value, the easiest first.
-
-    A value with more than a quarter of invalid episodes has no rates.
-    """
+    """Rates of one controller on a dose, a row a value, the easiest first; None with too many invalid episodes."""
     unit = dose.quantities[dose.parameter].unit
     about: dict[str, Any] = {"element": name, "parameter": dose.parameter, "unit": unit, "at": dict(dose.others)}
     rows = []
@@ -239,8 +215,7 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
         outcome, fallen = (array[number :: len(dose.values)].ravel() for array in (result.outcome, result.fallen))
         counted = counted_episodes(outcome == Outcome.INVALID)
         count = int(counted.sum())
-        left_out = len(counted) - count
-        row = {**about, "value": value, "controller": controller, "episodes": count, "left_out": left_out}
+        row = {**about, "value": value, "controller": controller, "episodes": count, "left_out": len(counted) - count}
         hits = {"goal": outcome == Outcome.GOAL, "fallen": fallen, "success": outcome != Outcome.BASE_COLLISION}
         for rate, is_hit in hits.items():
             num_hits = int((is_hit & counted).sum())
@@ -254,12 +229,12 @@ def measure_rates(name: str, dose: Dose, controller: str, result: RolloutResult)
 def find_half(dose: Dose, rows: Sequence[dict[str, Any]], result: RolloutResult) -> dict[str, Any]:
     """Where robots begin to pass less than half of the time, by straight lines between the values.
 
-    The ``interval`` is 95 % of a bootstrap over the terrains of a value, from the smallest to the largest. None is
-    beyond the values: ``beyond`` the ``first`` or the ``last``, or where all episodes of a value are ``invalid``.
+    The 95 % ``interval`` is by bootstrap over the terrains of a value. None is ``beyond`` the values: before the
+    ``first``, behind the ``last``, or where all episodes are ``invalid``.
     """
     crossed = [number for number, row in enumerate(rows) if row["goal_rate"] is not None]
     half: dict[str, Any] = {key: rows[0][key] for key in ("element", "parameter", "unit", "controller")}
-    unknown = {**half, "value": None, "beyond": "invalid", "interval": [None, None]}
+    unknown = half | {"value": None, "beyond": "invalid", "interval": [None, None]}
     if not crossed:
         return unknown
     counted = counted_episodes(result.outcome == Outcome.INVALID)
@@ -301,9 +276,12 @@ def show_dose(report: dict[str, Any]) -> None:
             passed = f"{half['value']:.2f} ({low} to {high})" if half["value"] is not None else _BEYOND[half["beyond"]]
             lines.append((half["controller"], *(format_value(rate, None, ".0%") for rate in rates), passed))
         values = [f"{row['value']:g}" for row in rows if row["controller"] == rows[0]["controller"]]
-        unit = f" [{rows[0]['unit']}]" if rows[0]["unit"] else ""
-        head = (f"{rows[0]['parameter']}{unit}", *values, "half of the robots pass")
+        head = (_label_parameter(rows[0]), *values, "half of the robots pass")
         show_table(f"{title}: robots that pass", head, lines)
+
+
+def _label_parameter(row: Mapping[str, Any]) -> str:
+    return f"{row['parameter']} [{row['unit']}]" if row["unit"] else row["parameter"]
 
 
 def draw_dose(report: Mapping[str, Any]) -> Figure:
@@ -317,22 +295,21 @@ def draw_dose(report: Mapping[str, Any]) -> Figure:
     panels = [figure.add_subplot(rows, columns, number) for number in range(1, 1 + len(elements))]
     for axes, element in zip(panels, elements, strict=True):
         element_rows = [row for row in report["dose"] if row["element"] == element]
-        for number, controller in enumerate(report["controllers"]):
+        styles = zip(report["controllers"], cycle(_COLOURS), cycle(_MARKERS), strict=False)
+        for controller, colour, marker in styles:
             rated = [row for row in element_rows if row["controller"] == controller and row["goal_rate"] is not None]
             values = [row["value"] for row in rated]
-            colour, marker = _COLOURS[number % len(_COLOURS)], _MARKERS[number % len(_MARKERS)]
             rates = [100.0 * row["goal_rate"] for row in rated]
             axes.plot(values, rates, label=controller, color=colour, marker=marker, markersize=4)
             low, high = ([100.0 * row["interval"][end] for row in rated] for end in (0, 1))
             axes.fill_between(values, low, high, color=colour, alpha=0.15, linewidth=0)
-        first, last = element_rows[0], element_rows[-1]
         title, _, others = report["titles"][element].partition(", ")
         axes.set_title(f"{title}\n{others}", fontsize=9)
-        axes.set_xlabel(f"{first['parameter']} [{first['unit']}]" if first["unit"] else first["parameter"], fontsize=8)
+        axes.set_xlabel(_label_parameter(element_rows[0]), fontsize=8)
         axes.set_ylim(-3, 103)
         axes.axhline(100.0 * FAILING_GOAL_RATE, color="0.7", linewidth=0.8, zorder=0)
         axes.tick_params(labelsize=8)
-        if first["value"] > last["value"]:
+        if element_rows[0]["value"] > element_rows[-1]["value"]:
             axes.invert_xaxis()
     for axes in panels[::columns]:
         axes.set_ylabel("pass [%]", fontsize=8)

@@ -1,8 +1,4 @@
-"""A gate for continuous integration and training: does a controller pass what a gate.toml asks of it?
-
-Episodes are crossed in rounds, one of every terrain, and sequential tests stop as soon as it is clear
-(:mod:`qd.evaluate.sequential`).
-"""
+"""A gate for continuous integration and training: does a controller pass a gate.toml, by sequential tests in rounds?"""
 
 import hashlib
 import os
@@ -11,7 +7,7 @@ import sys
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -32,6 +28,7 @@ from sim.controllers.spec import controller_identity, crosser_name
 from sim.files.atomic import prepare_output, read_json, write_atomically
 from sim.files.command import publish, say
 from sim.files.settings import NonNegativeInt, from_builtins, read_toml
+from sim.files.templates import open_templates
 from sim.rates import MAX_INVALID_SHARE
 from sim.robots.find import resolve_robot
 from sim.robots.robot import RobotCfg
@@ -40,11 +37,11 @@ from sim.terrains.maps.terrain_files import ExportedTerrain, encode_terrain
 from sim.terrains.spaces.registry import load_space, space_at
 from sim.terrains.terrains import Terrains
 
-Error = Annotated[float, Meta(ge=1e-3, lt=0.5)]
-Margin = Annotated[float, Meta(ge=1e-3, lt=0.5)]
+Small = Annotated[float, Meta(ge=1e-3, lt=0.5)]
 Limit = Annotated[float, Meta(gt=0, lt=1)]
 Name = Annotated[str, Meta(max_length=80, pattern=r"^[^\x00-\x1f|<>&`]*$")]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
+_TEMPLATES = open_templates(Path(__file__).parent / "templates")
 _SETS = ("hand_crafted", "hard_random")
 _SEED_KEY = 20261130  # with seed, check and round, the entropy of a round's episodes, and of nothing else
 _SAVED = 3  # terrains of a check
@@ -55,23 +52,14 @@ _AT_ONCE = 2_000  # episodes between two looks on a GPU, which many robots keep 
 class CheckCfg:
     """One table ``[[check]]`` of a gate.toml: terrains, and what is asked of controllers on them."""
 
-    name: Name = ""
-    """Of the check in reports; that of its pack or set if left out."""
-    pack: Name = ""
-    """A pack: its folder beside the gate.toml, or a published one: anymal, cassie or anymal@1."""
-    set: str = ""
-    """Or terrains that are drawn: hand_crafted or hard_random."""
-    space: str | None = None
-    """Space of a set, with ground and conditions, as `archive` has it: super_gaussian+noise+push."""
-    terrains: Count = 100
-    """How many: the first of a pack."""
-    limit: Limit | None = None
-    """Mean goal rate that is asked for; none if the check is of old against new alone."""
-    margin: Margin = 0.05
-    """A rate of limit - margin fails and one of limit + margin passes, but for the error. New may be worse than old by
-    less than this."""
-    rounds: Count = 40
-    """Episodes of a terrain at most."""
+    name: Name = ""  # of the check in reports; that of its pack or set if left out
+    pack: Name = ""  # a pack: its folder beside the gate.toml, or a published one: anymal, cassie or anymal@1
+    set: str = ""  # or terrains that are drawn: hand_crafted or hard_random
+    space: str | None = None  # space of hard_random, with ground and conditions: super_gaussian+noise+push
+    terrains: Count = 100  # how many: the first of a pack
+    limit: Limit | None = None  # mean goal rate that is asked for; none if the check is of old against new alone
+    margin: Small = 0.05  # limit - margin fails, limit + margin passes, but for the error; new may be less worse
+    rounds: Count = 40  # episodes of a terrain at most
 
     @property
     def title(self) -> str:
@@ -84,10 +72,8 @@ class GateCfg:
     """A gate.toml."""
 
     check: tuple[CheckCfg, ...]
-    error: Error = 0.05
-    """Chance of a wrong pass, and of a wrong fail, of each test that is clear."""
-    seed: NonNegativeInt = 0
-    """Draws terrains of sets, and all episodes."""
+    error: Small = 0.05  # chance of a wrong pass, and of a wrong fail, of each test that is clear
+    seed: NonNegativeInt = 0  # draws terrains of sets, and all episodes
 
 
 def read_gate(file: Path) -> GateCfg:
@@ -113,22 +99,13 @@ def read_gate(file: Path) -> GateCfg:
     return cfg
 
 
-def draw_round(terrains: Terrains, seed: int, check: int, number: int) -> Terrains:
-    """The terrains with the seeds of a round's episodes."""
-    sequence = np.random.SeedSequence([_SEED_KEY, seed], spawn_key=(check, number))
-    count = len(terrains)
-    return Terrains(**{**vars(terrains), "seeds": sequence.generate_state(count).astype(np.uint32)})
-
-
 class CheckTerrains(NamedTuple):
     """Terrains of a check."""
 
     terrains: Terrains
     sha256: str
-    known: list[Entry]
-    """What a pack says of them; nothing of others."""
-    pack: str | None
-    """The pack by its name and version."""
+    known: list[Entry]  # what a pack says of them; nothing of others
+    pack: str | None  # the pack by its name and version
 
 
 def check_terrains(check: CheckCfg, seed: int, robot: RobotCfg, folder: Path) -> CheckTerrains:
@@ -149,10 +126,7 @@ def run_check(
     check: CheckCfg, drawn: CheckTerrains, number: int, cfg: GateCfg,
     policies: Mapping[str, str], crosser: Crosser,
 ) -> dict[str, Any]:  # fmt: skip
-    """Crosses rounds until each test is clear: verdicts, counts and terrains that ``new`` fails, as JSON values.
-
-    Invalid episodes are counted, and left out of rates and pairs.
-    """
+    """Crosses rounds until each test is clear: verdicts, counts of valid episodes, and terrains that ``new`` fails."""
     began = time.perf_counter()
     terrains, known = drawn.terrains, drawn.known
     count, name = len(terrains), check.title
@@ -166,7 +140,8 @@ def run_check(
     done, clear = 0, dict[str, int]()
     while done < check.rounds and len(clear) < len(tests):
         some = range(done, min(done + each, check.rounds))
-        lot = Terrains.join([draw_round(terrains, cfg.seed, number, k) for k in some])
+        draws = [np.random.SeedSequence([_SEED_KEY, cfg.seed], spawn_key=(number, k)) for k in some]
+        lot = Terrains.join([replace(terrains, seeds=draw.generate_state(count)) for draw in draws])
         reached, valid = dict[str, NDArray[np.bool_]](), dict[str, NDArray[np.bool_]]()
         for by, policy in policies.items():
             label = f"{name}, {by}, round {done + 1} of at most {check.rounds}"
@@ -175,20 +150,20 @@ def run_check(
             reached[by] = result.reached_goal.reshape(len(some), count) & valid[by]
             goals[by] += [reached[by].sum(axis=0), valid[by].sum(axis=0)]
         done = some.stop
-        both = np.logical_and.reduce([*valid.values()])
-        if isinstance(test := tests.get("rate"), RateTest) and "rate" not in clear:
-            test.add(int(reached["new"].sum()), int(valid["new"].sum()))
-        if isinstance(test := tests.get("paired"), PairedTest) and "paired" not in clear:
-            lost, won = (reached[a] & ~reached[b] & both for a, b in (("old", "new"), ("new", "old")))
-            test.add(int(lost.sum()), int(won.sum()), int(both.sum()))
-        clear |= {kind: done for kind, test in tests.items() if kind not in clear and test.passes is not None}
+        hits: dict[str, tuple[NDArray[np.bool_], ...]] = {"rate": (reached["new"], valid["new"])}
+        if "old" in policies:
+            both = valid["old"] & valid["new"]
+            hits["paired"] = (reached["old"] & ~reached["new"] & both, reached["new"] & ~reached["old"] & both, both)
+        for kind, test in tests.items():
+            if kind not in clear:
+                test.add(*(int(hit.sum()) for hit in hits[kind]))
+                clear |= {kind: done} if test.passes is not None else {}
     episodes = done * count
     for by, (_, counted) in goals.items():
         if (invalid := episodes - int(counted.sum())) > MAX_INVALID_SHARE * episodes:
             rule = f"{name}: at most {MAX_INVALID_SHARE:.0%} of the episodes of {by} may be invalid"
-            raise ValueError(
-                f"{rule}, got {invalid} of {episodes}: `faultline check` says what is wrong with the robot"
-            )
+            got = f"{invalid} of {episodes}: `faultline check` says what is wrong with the robot"
+            raise ValueError(f"{rule}, got {got}")
     verdicts = {kind: (test.passes, "clear") if kind in clear else test.decide() for kind, test in tests.items()}
     reached_goal, counted = goals["new"]
     causes = np.array([str(entry["cause"] or "unclear") for entry in known])
@@ -230,11 +205,7 @@ def run_gate(
     file: Path, cfg: GateCfg, drawn: Sequence[CheckTerrains], robot: RobotCfg, policies: Mapping[str, str],
     compute: Compute,
 ) -> dict[str, Any]:  # fmt: skip
-    """Runs the checks of a gate.toml on the controller ``new`` of ``policies``, against ``old`` if there is one.
-
-    ``cfg`` are the file's settings, ``drawn`` the terrains of each check. A controller that does not cross level ground
-    fails, and is not asked further. Returns JSON values.
-    """
+    """Runs the checks of a gate.toml on ``new`` of the policies; one that does not cross level ground fails at once."""
     if lone := [check.title for check in cfg.check if check.limit is None and "old" not in policies]:
         rule = "a check without a limit is of old against new"
         raise ValueError(f"{rule}, got {lone[0]} and no old controller: give one")
@@ -263,16 +234,7 @@ def run_gate(
 
 def reason(check: Mapping[str, Any]) -> str:
     """Why a check passes or fails, in a line."""
-    parts = []
-    for kind, test in check["tests"].items():
-        limit, margin = (check["settings"][key] for key in ("limit", "margin"))
-        if kind == "rate":
-            asked = f"goal rate {test['goals'] / max(1, test['episodes']):.3f}, asked for {limit:g}"
-        else:
-            asked = f"{test['lost']} episodes lost, {test['won']} won against old, worse by {margin:g} is too much"
-        rounds = f"{test['rounds']} round{'s' * (test['rounds'] > 1)}"
-        parts.append(f"{asked}: {test['stopped']}, {rounds} of {check['terrains']} episodes")
-    return "; ".join(parts)
+    return _TEMPLATES.get_template("reason.txt").render(check)
 
 
 def to_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, float]]:
@@ -287,52 +249,33 @@ def to_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, float]]:
 def to_junit(report: Mapping[str, Any]) -> bytes:
     """The report as JUnit XML: a test case a check."""
     rows = to_rows(report)
-    counts = {word: str(sum(verdict == word for _, verdict, _, _ in rows)) for word in ("fail", "skipped")}
-    about = {"name": "faultline", "tests": str(len(rows)), "errors": "0", "failures": counts["fail"]}
-    suite = ElementTree.Element("testsuite", about | {"skipped": counts["skipped"], "timestamp": report["date"]})
+    verdicts = [verdict for _, verdict, _, _ in rows]
+    counts = {"tests": len(rows), "errors": 0, "failures": verdicts.count("fail"), "skipped": verdicts.count("skipped")}
+    about = {"name": "faultline", **{name: str(count) for name, count in counts.items()}, "timestamp": report["date"]}
+    about["time"] = f"{sum(row[-1] for row in rows):.3f}"
+    suites = ElementTree.Element("testsuites")
+    suite = ElementTree.SubElement(suites, "testsuite", about)
     properties = ElementTree.SubElement(suite, "properties")
     for name in ("robot", "policy", "policy_sha256", "gate_sha256", "commit", "device", "seed"):
         ElementTree.SubElement(properties, "property", name=name, value=str(report[name]))
     for name, verdict, why, seconds in rows:
-        case = ElementTree.SubElement(
-            suite, "testcase", classname=f"faultline.{report['robot']}", name=name, time=f"{seconds:.3f}"
-        )
+        about = {"classname": f"faultline.{report['robot']}", "name": name, "time": f"{seconds:.3f}"}
+        case = ElementTree.SubElement(suite, "testcase", about)
         if verdict == "pass":
             ElementTree.SubElement(case, "system-out").text = why
         else:
             ElementTree.SubElement(case, "failure" if verdict == "fail" else "skipped", message=why)
-    suite.set("time", f"{sum(row[-1] for row in rows):.3f}")
-    suites = ElementTree.Element("testsuites")
-    suites.append(suite)
     return ElementTree.tostring(suites, encoding="utf-8", xml_declaration=True)
 
 
 def to_markdown(report: Mapping[str, Any]) -> str:
     """The report as a summary in Markdown, as a step of GitHub's shows it."""
-    lines = [f"### faultline: {report['robot']} {'passes' if report['passes'] else 'fails'}", ""]
-    lines += ["| check | verdict | why |", "|---|---|---|"]
-    lines += [f"| {name} | **{verdict}** | {why} |" for name, verdict, why, _ in to_rows(report)]
-    for check in report["checks"]:
-        low, high = check["goal_interval"]
-        rates = ", ".join(f"{by} {rate:.3f}" for by, rate in check["goal_rate"].items())
-        invalid = f", {check['invalid_episodes']} of them invalid and left out" if check["invalid_episodes"] else ""
-        of_all = f"over all {check['episodes']} episodes{invalid}"
-        of_pack = f" of {check['pack']}" * bool(check["pack"])
-        fails = f"{len(check['failing'])} of {check['terrains']} terrains{of_pack} failed"
-        fails += f" in {check['rounds']} episodes each"
-        fails += f"; it was trained on {check['trained_on']} of them" * bool(check["trained_on"])
-        lines += ["", f"**{check['name']}**: goal rate {rates} (new {low:.3f} to {high:.3f}, 95 %) {of_all}; {fails}."]
-    tests, chance = sum(len(check["tests"]) for check in report["checks"]), report["error"]
-    error = f"A clear test is wrong with a chance of at most {chance:.3g}, at the margin from the limit or beyond"
-    error += f"; one of these {tests} with at most {min(1.0, tests * chance):.3g}." if tests > 1 else "."
-    return "\n".join([*lines, "", error, ""])
+    tests = sum(len(check["tests"]) for check in report["checks"])
+    return _TEMPLATES.get_template("gate.md").render(report, rows=to_rows(report), tests=tests) + "\n"
 
 
 def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], folder: Path) -> None:
-    """Writes some terrains of each failed check as height maps, which `faultline film --terrain` takes.
-
-    Those that old crosses come first. Terrains with ground or conditions, which a map does not have, are left out.
-    """
+    """Writes height maps of failed checks for `faultline film --terrain`, none with ground or conditions."""
     for old in folder.glob("*.npz"):
         old.unlink()
     for number, (found, of_check) in enumerate(zip(report["checks"], drawn, strict=False), 1):
@@ -348,18 +291,11 @@ def save_failing(report: Mapping[str, Any], drawn: Sequence[CheckTerrains], fold
 
 
 def publish_gate(
-    file: Path,
-    robot: RobotCfg,
-    policies: Mapping[str, str],
-    compute: Compute,
-    *,
-    out: Path | None = None,
-    junit: Path | None = None,
+    file: Path, robot: RobotCfg, policies: Mapping[str, str], compute: Compute, out: Path | None, junit: Path | None
 ) -> dict[str, Any]:
-    """Runs a gate (:func:`run_gate`), prints its summary and writes it: as JSON, beside it as .md, and as JUnit XML.
+    """Runs a gate, prints its summary and writes it: as JSON, beside it as .md, and as JUnit XML.
 
-    Where GITHUB_STEP_SUMMARY names a file, the summary is added to it. Some terrains that it fails lie in a folder
-    beside it, named as it is.
+    GITHUB_STEP_SUMMARY may name a file to which the summary is added. A folder named as the JSON has failed terrains.
     """
     out = out or RUNS / f"{crosser_name(robot, policies['new'])}-gate.json"
     if out.suffix != ".json" or (junit is not None and junit.resolve() in (out.resolve(), out.with_suffix(".md"))):
@@ -385,20 +321,15 @@ def publish_gate(
 
 
 class GateProcess:
-    """A gate that runs in a process of its own, beside a training: it holds none of the training's GPU memory.
-
-    Attributes:
-        out: File of the report, which is there once the process has ended.
-    """
+    """A gate in a process of its own, beside a training, whose GPU memory it does not hold; ``out`` gets its report."""
 
     def __init__(self, command: Sequence[str], out: Path) -> None:
         prepare_output(out)
         out.unlink(missing_ok=True)  # of another gate
         self.out, self._log = out, out.with_suffix(".log")
         with self._log.open("wb") as log:
-            self._process = subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-            )  # Ctrl-C of the training leaves it
+            pipes: Any = {"stdout": log, "stderr": subprocess.STDOUT}
+            self._process = subprocess.Popen(command, **pipes, start_new_session=True)  # Ctrl-C does not reach it
 
     @property
     def ended(self) -> bool:
@@ -436,13 +367,9 @@ def gate(
 ) -> GateProcess:  # fmt: skip
     """Starts a gate of a controller's file in a process of its own, and returns at once.
 
-    Args:
-        policy: File of the controller, as ``--policy`` takes it; it must stay until the gate has ended.
-        robot: Name of a shipped robot, or settings file of another.
-        gate: A gate.toml.
-        out: File of the report.
-        old: Controller that it is compared with.
-        device: A Warp device; CUDA if there is one.
+    ``policy`` and ``old``, with which it is compared, are files that must stay until the gate has ended; ``robot`` is a
+    shipped one or a settings file, ``gate`` a gate.toml. The report goes to ``out``. Without ``device`` it takes CUDA
+    if there is one.
     """
     command = [sys.executable, "-m", "faultline", "evaluate", "--gate", str(gate), "--robot", robot, "--out", str(out)]
     command += ["--policy", str(policy)] if old is None else ["--policies", f"old={old}", f"new={policy}"]

@@ -5,12 +5,9 @@ from pathlib import Path
 
 from sim.files.settings import NonNegativeInt, PositiveInt
 
-HELD_OUT = ("generated", "generated_far")
-"""Sets of elites held out of training: all, and the third that lies farthest from those trained on."""
-INDEPENDENT = "generated_independent"
-"""Set of elites of another search."""
-COMPARED = "elites"
-"""Set of elites that neither of two controllers was trained on, ``old`` and ``new``, which are compared on it."""
+HELD_OUT = ("generated", "generated_far")  # elites held out: all, and the third farthest from those trained on
+INDEPENDENT = "generated_independent"  # set of elites of another search
+COMPARED = "elites"  # elites that neither of two controllers, old and new, was trained on
 SETS = {
     "hand_crafted": "hand-crafted",
     "hard_random": "hard-random",
@@ -22,10 +19,8 @@ SETS = {
 MEASURES = {"goal": "goal reached", "success": "no base collision", "fallen": "fallen", "reward": "training reward"}
 """Label of each measure beside the penalties: three rates as fractions, and the sum of the reward over 20 s. No base
 collision is what the paper calls success."""
-CERTIFIED = {"certified_goal": "goal", "certified_success": "success"}
-"""Measures on the certified terrains of a set alone, by what they measure."""
-RATES = ("goal", "success", "fallen")
-"""Measures that lie between 0 and 1, and so do their intervals."""
+CERTIFIED = {"certified_goal": "goal", "certified_success": "success"}  # measures on certified terrains alone
+RATES = ("goal", "success", "fallen")  # measures that lie between 0 and 1, and so do their intervals
 FATES = {fate: fate.replace("_", " ") for fate in ("mended", "still_failing", "newly_broken", "fine")}
 """What may have become of a terrain from one controller to another: failed by the first, both, the second, neither."""
 

@@ -24,22 +24,19 @@ from sim.robots.user import write_setting
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
 from sim.terrains.terrains import Terrains
 
-MIN_GOAL_RATE = 0.9
-"""Share of episodes on level ground that reach the goal, below which a controller does not walk."""
+MIN_GOAL_RATE = 0.9  # share of episodes on level ground that reach the goal, below which a controller does not walk
 _EPISODES = 20
 _MIN_SPEED = 0.15  # a slower controller does not walk, whatever its time [m/s]
 _SPARE_TIME = 1.25  # a crossing gets so many times what it takes on level ground
 _DISTANCE = math.dist(CrossingCfg.start, CrossingCfg.goal)
 _ENGINES: dict[str, tuple[Engine, str]] = {"searched": ("search", ""), "mujoco_c": ("mujoco_c_search", "_mujoco_c")}
-Walks = dict[str, dict[str, float]]
 
 
-def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = False) -> Walks:
+def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = False) -> dict[str, Any]:
     """How a controller walks over level ground here, ``searched``, and if asked in MuJoCo C, ``mujoco_c``.
 
-    Each has ``episodes`` that are valid, the share ``goal`` of them that reach it, ``speed`` toward the goal until the
-    end [m/s], and ``height`` of the base at the end [m]; all are 0 without a valid episode. What was measured of a
-    user's robot as it is, under this controller, is read from its file; the rest is added to it.
+    Each has valid ``episodes``, the share ``goal`` that reaches it, ``speed`` toward the goal [m/s], and ``height`` of
+    the base at the end [m]; all are 0 without a valid episode. What is known of a user's robot is read from its file.
     """
     robot = crosser.robot
     file, identity = robot.home / f"{crosser_name(robot, policy)}.level.json", controller_identity(robot, policy)
@@ -47,7 +44,7 @@ def measure_level_ground(crosser: Crosser, policy: str, *, mujoco_c: bool = Fals
     stored: dict[str, Any] = read_json(file) if is_stored and file.exists() else {}
     stored = stored if identity.items() <= stored.items() else {**identity}
     level = Terrains(heights=np.zeros((1, NUM_ROWS, NUM_COLS), np.float32), seeds=np.zeros(1, int))
-    walks: Walks = {}
+    walks: dict[str, dict[str, float]] = {}
     for name, (engine, suffix) in [*_ENGINES.items()][: 1 + mujoco_c]:
         keys = {key: f"flat_{key}{suffix}" for key in ("episodes", "goal", "speed", "height")}
         if keys["episodes"] not in stored:

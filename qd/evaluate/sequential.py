@@ -3,22 +3,20 @@
 They hold whatever the terrains' own rates are, and however often one looks:
 
 - *Rate*: wealth that bets on mean goal rates above ``limit - margin``, half of it on ``limit + margin`` and half on all
-  by Beta(1/2, 1/2), is a likelihood ratio. It is at most 1 in expectation over a round whose terrains' mean rate is
-  that or less, since a geometric mean is at most an arithmetic one, and so exceeds 1 / error with a chance of at most
-  ``error`` (Ville 1939). Once it does, and the rate is above the limit, the controller passes. It fails likewise, by
-  bets on rates below ``limit + margin``.
+  by Beta(1/2, 1/2), is a likelihood ratio: at most 1 in expectation over a round whose mean rate is that or less, since
+  a geometric mean is at most an arithmetic one. It exceeds 1 / error with a chance of at most ``error`` (Ville 1939).
+  Then, if the rate is above the limit, the controller passes. By bets on rates below ``limit + margin`` it fails.
 - *Old against new*: pairs of equal terrain, seed and replica differ by d = -1, 0 or 1. Wealth that bets a share x on d,
-  times 1 + x d, grows with a chance of at most ``error`` beyond 1 / error where the mean of d is not positive (Waudby-
-  Smith and Ramdas 2024); bets are means over :data:`BETS`. At the end of all rounds McNemar's exact test decides, and
-  new must not have lost half of the margin or more.
+  times 1 + x d, grows beyond 1 / error with a chance of at most ``error`` where the mean of d is not positive (Waudby-
+  Smith and Ramdas 2024); bets are means over :data:`BETS`. At the end McNemar's exact test decides, and new must not
+  have lost half of the margin or more.
 """
 
 import numpy as np
 from scipy.special import betainc, betaincc, betaln
 from scipy.stats import binomtest
 
-BETS = np.linspace(0.02, 0.98, 49)
-"""Shares of the wealth."""
+BETS = np.linspace(0.02, 0.98, 49)  # shares of the wealth
 
 
 def _log_mixture(goals: int, misses: int, low: float = 0.0, high: float = 1.0) -> float:
@@ -68,8 +66,7 @@ def rate_interval(goals: int, episodes: int, level: float = 0.95) -> list[float]
     rates = np.sort(np.append(np.linspace(0.0005, 0.9995, 1000), np.clip(rate, 1e-6, 1.0 - 1e-6)))
     wealth = _log_mixture(goals, misses) - goals * np.log(rates) - misses * np.log1p(-rates)
     kept = np.flatnonzero(wealth < -np.log(1.0 - level))
-    ends = np.concatenate([[0.0], rates, [1.0]])[[kept[0], kept[-1] + 2]]  # a step outward
-    return ends.tolist()
+    return np.concatenate([[0.0], rates, [1.0]])[[kept[0], kept[-1] + 2]].tolist()  # a step outward
 
 
 class PairedTest:

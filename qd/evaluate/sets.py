@@ -1,11 +1,8 @@
 """The terrains that controllers are evaluated on, and which elites of an archive are held out of training.
 
-A test set is drawn from random numbers used nowhere else: not in training, calibration or search. All controllers cross
-the same terrains with the same episode seeds. Validation sets, by which settings are chosen, have other terrains of the
-same kinds: no setting is chosen by the reported terrains.
-
-The archive determines which elites are held out. An archive that grew holds out others, and a controller may have been
-trained on some of them before: the marks of its elites, in its file or in its training record, say so.
+A test set is drawn from random numbers used nowhere else. All controllers cross the same terrains with the same seeds.
+Validation sets, by which settings are chosen, have other terrains of the same kinds. An archive that grew holds other
+elites out; the marks of those trained on, in a controller's file or its training record, say which it has seen.
 """
 
 import hashlib
@@ -13,7 +10,7 @@ from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +31,10 @@ from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
-TRAINED_ON = "trained_on"
-"""Key of the training record, and of checkpoint and controller, with the marks of all elites trained on."""
+TRAINED_ON = "trained_on"  # key of training record, checkpoint and controller, with the marks of all elites trained on
 _MARK_LENGTH = 12  # of 2,000 elites, two have the same with a chance of one in 100 million
-Purpose = Literal["test", "validation"]
-"""What terrains are for: numbers to report, or the choice of settings."""
-MIN_ELITES = 5
-"""Fewest elites that can be split: a fifth of them is one."""
+Purpose = Literal["test", "validation"]  # what terrains are for: numbers to report, or the choice of settings
+MIN_ELITES = 5  # fewest elites that can be split: a fifth of them is one
 _TRAINING_ELITES = 750  # the paper's
 _HELD_OUT_SHARE = 0.2
 _VALIDATION_SHARE = 0.1  # of as many elites as are trained on
@@ -50,15 +44,12 @@ _NAMES = ("hand_crafted", "hard_random", "flat", "generated", "pack", INDEPENDEN
 _BANK = 50  # height maps that are compared at once
 
 
-@dataclass(frozen=True, kw_only=True)
-class EliteSplit:
+class EliteSplit(NamedTuple):
     """Elites to train on and elites held out, as rows of the archive in the order drawn; the three are disjoint."""
 
     train: NDArray[np.int64]
-    validation: NDArray[np.int64]
-    """Held out for the choice of settings."""
-    test: NDArray[np.int64]
-    """Held out for reported numbers: the first n are a random choice of n of them."""
+    validation: NDArray[np.int64]  # held out for the choice of settings
+    test: NDArray[np.int64]  # held out for reported numbers: the first n are a random choice of n of them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,14 +57,10 @@ class TerrainSet(ColumnTable):
     """T terrains to cross, and what is known of each."""
 
     terrains: Terrains
-    numbers: NDArray[np.int64]
-    """Number of each terrain, shape (T,): an elite's row in the archive, else the index in the set."""
-    types: NDArray[np.int64] | None = None
-    """Index into :data:`sim.terrains.hand_crafted.CROSSING_TYPES` of each hand-crafted terrain, shape (T,)."""
-    levels: NDArray[np.int64] | None = None
-    """Level of each hand-crafted terrain, shape (T,)."""
-    elites: Archive | None = None
-    """The elites as an archive, with their families; None of other terrains."""
+    numbers: NDArray[np.int64]  # of each terrain, shape (T,): an elite's row in the archive, else the index in the set
+    types: NDArray[np.int64] | None = None  # index into CROSSING_TYPES of each hand-crafted terrain, shape (T,)
+    levels: NDArray[np.int64] | None = None  # level of each hand-crafted terrain, shape (T,)
+    elites: Archive | None = None  # the elites as an archive, with their families; None of other terrains
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -97,10 +84,9 @@ def paper_terrains(robot: str) -> int:
 def split_elites(archive: Archive, *, held_out: bool = True) -> EliteSplit:
     """Draw at random which elites are trained on and which are held out; without ``held_out`` all are trained on.
 
-    If the archive has as many elites as the paper's, 750 are trained on and 300 (ANYmal) or 180 (Cassie) are tested on;
-    else 80 % and 20 %. Validation has a tenth as many as training, at least one, from those left over; if too few are
-    left over, training has fewer. The draw depends on the elites' genes alone, not on their order in the file: judging
-    an archive again, which reorders it, changes no elite's purpose.
+    Of as many elites as the paper's, 750 are trained on and 300 (ANYmal) or 180 (Cassie) tested on; else 80 % and 20 %.
+    Validation has a tenth as many as training from those left over, or else of training's. The draw depends on the
+    genes alone: judging an archive again, which reorders it, changes no elite's purpose.
     """
     if not held_out:
         none = np.zeros(0, np.int64)
@@ -202,10 +188,7 @@ def _set_of_elites(archive: Archive, rows: NDArray[np.int64], seeds: NDArray[np.
 def nearest_distance(
     genes: NDArray[np.float32], training_genes: NDArray[np.float32], space: TerrainSpace = SUPER_GAUSSIAN
 ) -> NDArray[np.float64]:
-    """Root mean square distance over all nodes [m] of T height maps to the nearest training map, shape (T,).
-
-    Genes have shape (T, num_genes) and (N, num_genes). Computed on the CPU, so that it is the same everywhere.
-    """
+    """RMS distance [m] of T height maps to the nearest training map, (T,); on the CPU, so it is the same everywhere."""
     banks = (make_heights(rows, space) for rows in (genes, training_genes))
     maps, training_maps = (bank.reshape(len(bank), -1).astype(np.float64) for bank in banks)
     banks = (training_maps[first : first + _BANK] for first in range(0, len(training_maps), _BANK))
@@ -224,8 +207,7 @@ def make_sets(
 ) -> dict[str, TerrainSet]:
     """The sets of the tables by name, in the order of :data:`qd.evaluate.labels.SETS`; without names all possible ones.
 
-    A set has ``count`` terrains, or all that the archive holds out. ``archive`` has the elites for ``generated`` and
-    ``generated_far``, ``independent`` those for ``generated_independent``; hard-random terrains are of ``space``.
+    Each has ``count`` terrains, or all that there are; elites are of ``archive``, held out, and ``independent``.
     """
     lacking = {*(HELD_OUT if archive is None else ()), *((INDEPENDENT,) if independent is None else ())}
     names = names or [name for name in SETS if name not in lacking]
@@ -240,8 +222,7 @@ def make_sets(
         if "generated_far" in names:
             training_genes = archive.genes[split_elites(archive).train]
             distance = nearest_distance(whole.terrains.values, training_genes, whole.terrains.space)
-            third = np.sort(np.argsort(-distance, kind="stable")[: -(-len(whole) // 3)])
-            sets["generated_far"] = whole.rows(third)
+            sets["generated_far"] = whole.rows(np.sort(np.argsort(-distance, kind="stable")[: -(-len(whole) // 3)]))
     if independent is not None and INDEPENDENT in names:
         sets[INDEPENDENT] = random_elites(INDEPENDENT, independent, count, seed)
     return {name: sets[name] for name in SETS if name in names}

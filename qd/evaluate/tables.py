@@ -1,56 +1,180 @@
-"""The evaluation's tables: what ``tables.json`` says of controllers on sets of terrains.
+"""Numbers of controllers on terrains, and the evaluation's tables of them: what ``tables.json`` says.
 
-A controller *fails* a terrain if under half of its valid episodes reach the goal; an episode with a base collision
-does not. Between two controllers, a terrain is *mended* (the first fails, the second does not), *still failing* (both
-fail), *newly broken* (the second alone fails) or *fine* (neither fails). Where a goal rate is near a half, a change may
-be chance. A change is *clear* if the 95 % intervals (Wilson) of the two goal rates do not overlap.
+A controller *fails* a terrain if under half of its valid episodes reach the goal. Between two controllers, a terrain is
+*mended* (the first alone fails), *still failing*, *newly broken* (the second alone fails) or *fine*. A change is
+*clear* if the 95 % intervals (Wilson) of the two goal rates do not overlap; else it may be chance.
 """
 
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from scipy.special import stdtrit
 
+from kernels.episode import Outcome
 from qd.evaluate.labels import CERTIFIED, COMPARED, MEASURES, RATES, SETS
-from qd.evaluate.measures import Performance, kind_mean, measure_bounds, valid_interval, valid_mean
 from qd.evaluate.sets import TerrainSet
 from qd.search.fitness import FAILING_GOAL_RATE
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import read_json
 from sim.files.command import say
-from sim.files.intervals import format_value, wilson_interval
+from sim.files.intervals import DIFFERENCES, bootstrap_interval, format_value, wilson_interval
+from sim.files.intervals import RATES as BOUNDS
+from sim.rates import counted_episodes, terrain_means
 from sim.robots.robot import RobotCfg, check_robot_digest
+from sim.rollout import RolloutResult
+from sim.terrains.hand_crafted import CROSSING_TYPES
 
 Tables = dict[str, Any]
 """Numbers of controllers on sets of terrains, as JSON values; rates are fractions, None where no terrain is valid.
 
-- ``goal``, ``success``, ``fallen``, ``reward``: set -> controller -> mean over the set's terrains; ``certified_goal``
-  and ``certified_success`` over its certified terrains alone; ``penalties`` by penalty, scaled.
-- ``intervals``: measure -> set -> controller -> 95 % interval, None where the spread is unknown.
-- ``over_seeds``: measure -> set -> kind with several controllers -> ``mean``, ``interval`` over terrains and
-  controllers, and ``values`` of the controllers.
-- ``certified``: set -> number of ``terrains``; ``certifiers``, how many terrains each certifies; and ``chosen_by``,
-  controller -> ``certifier``, whose rate on them is biased upward, or ``searched``, whose rate is biased downward.
-- ``differences``: set -> ``first -> second`` -> ``compared`` terrains, which are valid for both; ``mended``,
-  ``still_failing``, ``newly_broken`` and ``fine``, each with its ``count`` and the numbers of its ``terrains`` (not of
-  the fine ones); how many changes are ``clear``; ``gain``, measure -> ``mean`` difference with its ``interval``.
-- ``terrains``: set -> number of terrains; ``episodes``: number on each.
-- ``controllers``: ``policy`` and ``sha256`` by name.
+- ``goal``, ``success``, ``fallen``, ``reward``: set -> controller -> mean; ``certified_goal`` and ``certified_success``
+  over certified terrains alone; ``penalties`` by penalty, scaled; ``intervals``: measure -> the same.
+- ``over_seeds``: measure -> set -> kind with several controllers -> ``mean``, ``interval``, ``values``.
+- ``certified``: set -> ``terrains``; ``certifiers``, how many each certifies; ``chosen_by``, controller ->
+  ``certifier``, whose rate on them is biased upward, or ``searched``, whose rate is biased downward.
+- ``differences``: set -> ``first -> second`` -> ``compared`` terrains; fates, each with ``count``, ``terrains`` and how
+  many are ``clear``; ``gain``, measure -> ``mean`` difference with its ``interval``.
 """
+VELOCITY_FROM_S = 2.0  # the velocity error counts from this time of an episode on [s]: before it the robot gets going
 _MEASURES = (*MEASURES, *CERTIFIED)
 _WIDTH = 160  # of tables in a file
 _FORMS = {"goal": ".3f", "success": ".3f", "fallen": ".3f", "reward": ".1f"}
 
-Value = TypeVar("Value")
-Performances = Mapping[str, Mapping[str, Performance]]
-"""Set -> controller -> its numbers on the set's terrains."""
+
+@dataclass(frozen=True, kw_only=True)
+class Performance:
+    """A controller's numbers on each of T terrains, by valid episodes; NaN where over a quarter of them are invalid."""
+
+    values: dict[str, NDArray[np.float64]]  # mean of each measure on each terrain, shape (T,)
+    penalties: dict[str, NDArray[np.float64]]  # mean of each scaled penalty on each terrain, shape (T,)
+    goals: NDArray[np.int64]  # valid episodes that reached the goal, shape (T,)
+    episodes: NDArray[np.int64]  # valid episodes, shape (T,); 0 on an invalid terrain
+
+
+def valid_mean(values: NDArray[np.float64]) -> float | None:
+    """Mean over terrains, shape (T,), without the invalid ones, which are NaN; None without any."""
+    valid = values[~np.isnan(values)]
+    return float(valid.mean()) if len(valid) else None
+
+
+def valid_interval(
+    values: NDArray[np.float64], seed: int, families: NDArray[np.int64] | None, bounds: tuple[float, float] | None
+) -> list[float] | None:
+    """95 % interval of :func:`valid_mean`: bootstrap over terrains, or over their families."""
+    valid = ~np.isnan(values)
+    families = None if families is None else families[valid]
+    return bootstrap_interval(values[valid], seed, families=families, bounds=bounds)
+
+
+def measure_bounds(measure: str, *, differences: bool = False) -> tuple[float, float] | None:
+    """Least and largest value of a measure, or of differences of it; None if it has no bounds."""
+    return (DIFFERENCES if differences else BOUNDS) if CERTIFIED.get(measure, measure) in RATES else None
+
+
+def kind_mean(
+    values: Sequence[NDArray[np.float64]], families: NDArray[np.int64] | None, seed: int, measure: str = "goal"
+) -> dict[str, Any] | None:
+    """The mean of a measure for one kind of controller, or the difference of two kinds, the first minus the second.
+
+    ``values`` has the measure for each kind, shape (num_trainings, num_terrains). Returns ``mean``, its 95 %
+    ``interval`` and the number of trainings (``seeds``) of each kind; None without a terrain that is valid for all. The
+    interval is Student's, of the variances over families (bootstrap) and over trainings, with Satterthwaite's degrees
+    of freedom (1946), no narrower than the bootstrap's. One training says nothing of others.
+    """
+    valid = np.logical_and.reduce([np.isfinite(kind).all(axis=0) for kind in values])
+    if not valid.any():
+        return None
+    kinds = [sign * kind[:, valid] for sign, kind in zip((1.0, -1.0), values, strict=False)]
+    by_terrain = np.sum([kind.mean(axis=0) for kind in kinds], axis=0)
+    bounds = measure_bounds(measure, differences=len(kinds) > 1)
+    bootstrap = valid_interval(by_terrain, seed, None if families is None else families[valid], bounds)
+    variances = [(kind.mean(axis=1).var(ddof=1) / len(kind), len(kind) - 1) for kind in kinds if len(kind) > 1]
+    variance = sum(value for value, _ in variances)
+    if bootstrap is not None:
+        variance = ((bootstrap[1] - bootstrap[0]) / (2.0 * stdtrit(np.inf, 0.975))) ** 2 + variance
+    spread = sum(value**2 / freedom for value, freedom in variances)
+    freedom = variance**2 / spread if spread > 0.0 else np.inf
+    mean = float(by_terrain.mean())
+    interval = bootstrap
+    if variances:
+        half = float(stdtrit(freedom, 0.975) * np.sqrt(variance))
+        low, high = bootstrap or (mean, mean)
+        interval = [min(mean - half, low), max(mean + half, high)]
+    if interval and bounds:
+        interval = np.clip(interval, *bounds).tolist()
+    return {"mean": mean, "interval": interval, "seeds": [len(kind) for kind in kinds]}
+
+
+def terrain_rates(result: RolloutResult) -> dict[str, NDArray[np.float64]]:
+    """``success`` (no base collision), ``goal`` and ``fallen`` rate of each terrain, shape (T,); NaN if invalid."""
+    counted = counted_episodes(result.invalid)
+    hits = {"success": ~result.base_collision, "goal": result.reached_goal, "fallen": result.fallen}
+    return {name: terrain_means(hit, counted) for name, hit in hits.items()}
+
+
+def measure(result: RolloutResult, scales: Sequence[float]) -> Performance:
+    """A controller's numbers from its crossings with their reward; ``scales`` has each penalty's scale, in order."""
+    if result.reward is None:
+        raise ValueError("crossings must come with their reward, got none: ask the evaluator for it (reward=True)")
+    counted = counted_episodes(result.invalid)
+    return Performance(
+        values={**terrain_rates(result), "reward": terrain_means(result.reward, counted)},
+        penalties={
+            name: terrain_means(result.penalties[..., column] / scale, counted)
+            for column, (name, scale) in enumerate(zip(result.penalty_names, scales, strict=True))
+        },
+        goals=(result.reached_goal & counted).sum(axis=1),
+        episodes=counted.sum(axis=1),
+    )
+
+
+def summarise_crossings(
+    result: RolloutResult, seed: int, *, types: np.ndarray | None = None, levels: np.ndarray | None = None
+) -> dict[str, Any]:
+    """Rates over a set of terrains, with 95 % intervals and, where known, by type and level."""
+    rates = {f"{name}_rate": values for name, values in terrain_rates(result).items()}
+
+    def summarise(mask: NDArray[np.bool_]) -> dict[str, Any]:
+        return {"terrains": int(mask.sum())} | {name: valid_mean(values[mask]) for name, values in rates.items()}
+
+    counts = {outcome: int((result.outcome == outcome).sum()) for outcome in Outcome}
+    return {
+        **summarise(np.ones(len(result.outcome), bool)),
+        **{f"{name}_interval": valid_interval(values, seed, None, BOUNDS) for name, values in rates.items()},
+        "episodes": int(result.outcome.size),
+        "outcomes": {end.name.lower(): count for end, count in counts.items() if count or end < Outcome.TILT},
+        "invalid_terrains": int(np.isnan(rates["success_rate"]).sum()),
+        "by_type": None if types is None else {CROSSING_TYPES[k]: summarise(types == k) for k in np.unique(types)},
+        "by_level": None if levels is None else {str(k): summarise(levels == k) for k in np.unique(levels)},
+    }
+
+
+def velocity_error(result: RolloutResult, seed: int) -> dict[str, Any]:
+    """Error of v_x in valid episodes, of penalties from :data:`VELOCITY_FROM_S` on: root of its mean square [m/s]."""
+    counted_s = result.duration_s - VELOCITY_FROM_S
+    usable = ~result.invalid & (counted_s > 0.0)
+    error = np.sqrt(result.penalties[..., result.penalty_names.index("vel_x")] / np.where(usable, counted_s, 1.0))
+    per_terrain = np.array([row[use].mean() for row, use in zip(error, usable, strict=True) if use.any()])
+    return {
+        "vx_error_mean": float(error[usable].mean()) if usable.any() else None,
+        "vx_error_interval": bootstrap_interval(per_terrain, seed),
+        "episodes": int(usable.sum()),
+        "goal_rate": float(result.reached_goal[~result.invalid].mean()) if not result.invalid.all() else None,
+    }
+
+
+Sets = Mapping[str, TerrainSet]
+Controllers = Mapping[str, Mapping[str, str | None]]  # policy and sha256 by name
+Performances = Mapping[str, Mapping[str, Performance]]  # set -> controller -> its numbers on the set's terrains
 
 
 def read_tables(file: Path, robot: RobotCfg) -> Tables:
@@ -80,13 +204,7 @@ def as_tables(content: Any) -> Tables:
 
 
 def make_tables(
-    performances: Performances,
-    sets: Mapping[str, TerrainSet],
-    robot: RobotCfg,
-    *,
-    controllers: Mapping[str, Mapping[str, str | None]],
-    episodes: int,
-    seed: int,
+    performances: Performances, sets: Sets, robot: RobotCfg, *, controllers: Controllers, episodes: int, seed: int
 ) -> Tables:
     """The tables of controllers on sets of terrains."""
     means: dict[str, dict[str, Any]] = {key: {} for key in (*_MEASURES, "penalties")}
@@ -135,24 +253,21 @@ def _list_measures(
             yield key, {name: np.where(certified, measured.values[measure], np.nan) for name, measured in row.items()}
 
 
-def _count_certified(
-    sets: Mapping[str, TerrainSet], controllers: Mapping[str, Mapping[str, str | None]]
-) -> dict[str, Any]:
+def _count_certified(sets: Sets, controllers: Controllers) -> dict[str, Any]:
     certified = {}
     for name, terrains in sets.items():
         elites = terrains.elites
         if elites is None or not elites.certifiers:
             continue
-        certificates = elites.certificates & elites.failing[:, None]
-        certifiers = dict(zip(elites.certifiers, certificates.sum(axis=0).tolist(), strict=True))
-        hashes = dict(zip(elites.certifiers, elites.certifier_sha256, strict=True))
-        roles: dict[str | None, str] = {elites.policy_sha256: "searched"}
-        roles |= {hashes[certifier]: "certifier" for certifier, count in certifiers.items() if count}
+        counts = (elites.certificates & elites.failing[:, None]).sum(axis=0).tolist()
+        roles = {elites.policy_sha256: "searched"}
+        roles |= {digest: "certifier" for digest, count in zip(elites.certifier_sha256, counts, strict=True) if count}
         roles.pop(None, None)
-        known = {name: about["sha256"] for name, about in controllers.items() if about["sha256"] in roles}
-        chosen_by = {name: roles[digest] for name, digest in known.items()}
-        terrains_certified = int(elites.certified_by_controllers.sum())
-        certified[name] = {"terrains": terrains_certified, "certifiers": certifiers, "chosen_by": chosen_by}
+        certified[name] = {
+            "terrains": int(elites.certified_by_controllers.sum()),
+            "certifiers": dict(zip(elites.certifiers, counts, strict=True)),
+            "chosen_by": {by: roles[about["sha256"]] for by, about in controllers.items() if about["sha256"] in roles},
+        }
     return certified
 
 
@@ -160,11 +275,10 @@ def difference(before: Performance, after: Performance, terrains: TerrainSet, se
     """What became of each terrain of a set from one controller to another, and the mean gain of the second."""
     valid = (before.episodes > 0) & (after.episodes > 0)
     failed, fails = (valid & (controller.values["goal"] < FAILING_GOAL_RATE) for controller in (before, after))
-    limits = _wilson_limits(before)
-    then_limits = _wilson_limits(after)
+    counts = (zip(by.goals.tolist(), by.episodes.tolist(), strict=True) for by in (before, after))
+    limits, then_limits = (np.array([wilson_interval(*pair) for pair in pairs]) for pairs in counts)
     clear = (limits[:, 1] < then_limits[:, 0]) | (then_limits[:, 1] < limits[:, 0])
-    mended = failed & ~fails
-    broken = ~failed & fails
+    mended, broken = failed & ~fails, ~failed & fails
 
     def describe(mask: NDArray[np.bool_]) -> dict[str, Any]:
         return {"count": int(mask.sum()), "terrains": np.sort(terrains.numbers[mask]).tolist()}
@@ -185,19 +299,10 @@ def difference(before: Performance, after: Performance, terrains: TerrainSet, se
 
 
 def is_regression(tables: Mapping[str, Any]) -> bool:
-    """Whether the goal rate's difference of :data:`COMPARED` elites, new minus old, has an interval wholly below 0.
-
-    A terrain that newly fails is no regression alone: of hundreds some do by chance. Tables of other sets have none.
-    """
+    """Whether :data:`COMPARED` elites have a difference of the goal rate, new minus old, wholly below 0."""
     pairs = tables["differences"].get(COMPARED)
     interval = pairs["old -> new"]["gain"]["goal"]["interval"] if pairs else None
     return interval is not None and interval[1] < 0.0
-
-
-def _wilson_limits(measured: Performance) -> NDArray[np.float64]:
-    """Interval of the goal rate on each terrain, shape (T, 2); anything possible on an invalid one."""
-    counts = zip(measured.goals.tolist(), measured.episodes.tolist(), strict=True)
-    return np.array([wilson_interval(goals, episodes) for goals, episodes in counts])
 
 
 def check_seeds(controllers: Mapping[str, str]) -> None:
@@ -212,15 +317,15 @@ def check_seeds(controllers: Mapping[str, str]) -> None:
         names[key] = name
 
 
-def by_kind(row: Mapping[str, Value]) -> dict[str, list[Value]]:
+def by_kind(row: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Groups values of controllers, by name, by their kinds: C-G, C-G@1 and C-G@2 differ in their seeds alone."""
-    kinds: dict[str, list[Value]] = {}
+    kinds: dict[str, list[Any]] = {}
     for name, value in row.items():
         kinds.setdefault(name.partition("@")[0], []).append(value)
     return kinds
 
 
-def over_seeds(performances: Performances, sets: Mapping[str, TerrainSet], seed: int) -> dict[str, Any]:
+def over_seeds(performances: Performances, sets: Sets, seed: int) -> dict[str, Any]:
     """Mean over the controllers of each kind that has several: measure -> set -> kind."""
     summaries: dict[str, dict[str, dict[str, Any]]] = {}
     for name, row in performances.items():

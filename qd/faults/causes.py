@@ -1,7 +1,7 @@
 """The shape of a part of a terrain, as a robot that walks straight to the goal meets it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,7 @@ _NARROW = 0.5  # a part that falls to half of its height within this distance of
 SLIPPERY = "slippery ground"
 SOFT = "soft ground"
 OFF_THE_WAY = "beside the way"
-UNCLEAR = "unclear"
-"""The cause where no part of the terrain lies where robots end."""
+UNCLEAR = "unclear"  # the cause where no part of the terrain lies where robots end
 _STRAIGHT = {"rise": "high", "drop": "deep", "ridge": "high", "ditch": "deep"}
 SHAPES: dict[str, str | None] = {
     **_STRAIGHT,
@@ -51,38 +50,25 @@ _FIRST_MET = 0.9  # share of the steepest slope; the first place that is as stee
 class Shape:
     """How a robot meets a part that lies alone on flat ground. Slopes are those of its steepest place."""
 
-    kind: str
-    """One of :data:`SHAPES`, :data:`SLIPPERY`, :data:`SOFT`, or the cause of a condition; docs/faults.md has limits."""
-    height_m: float
-    """Height under the robot where it is largest, negative of a hollow [m]."""
-    slope_deg: float
-    """Steepest slope under the robot [degrees]."""
-    along_deg: float
-    """Slope along the way, negative where the ground falls [degrees]."""
-    across_deg: float
-    """Slope across the way [degrees]."""
-    oblique_deg: float
-    """Angle between the way and the direction in which the ground rises or falls most, 0 to 90 [degrees]."""
-    length_m: float
-    """Length over which it has at least half of that height, along the way through that place [m]."""
-    left_m: float
-    """How far left of the way it has that height, within 1 m along the way of that place [m]."""
-    right_m: float
-    """How far right of the way [m]; negative where it lies to the left alone."""
+    kind: str  # one of SHAPES, SLIPPERY, SOFT, or the cause of a condition; docs/faults.md has limits
+    height_m: float = 0.0  # height under the robot where it is largest, negative of a hollow [m]
+    slope_deg: float = 0.0  # steepest slope under the robot [degrees]
+    along_deg: float = 0.0  # slope along the way, negative where the ground falls [degrees]
+    across_deg: float = 0.0  # slope across the way [degrees]
+    oblique_deg: float = 0.0  # angle between the way and the steepest rise or fall, 0 to 90 [degrees]
+    length_m: float = 0.0  # length of the way over which it has at least half of that height, through that place [m]
+    left_m: float = 0.0  # how far left of the way it has that height, within 1 m along the way of that place [m]
+    right_m: float = 0.0  # how far right of the way [m]; negative where it lies to the left alone
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
     """What each of some parts of a terrain does."""
 
-    heights: NDArray[np.float32]
-    """Heights that it adds to the others [m], shape (num_parts, nrow, ncol)."""
-    slippery: NDArray[np.bool_]
-    """Patches that it makes slippery, shape (num_parts, rows, cols) of its map."""
-    soft: NDArray[np.bool_]
-    """Patches that it makes soft, of the same shape."""
-    conditions: tuple[str, ...]
-    """The kind of condition that each part sets; empty where it sets none."""
+    heights: NDArray[np.float32]  # heights that it adds to the others [m], shape (num_parts, nrow, ncol)
+    slippery: NDArray[np.bool_]  # patches that it makes slippery, shape (num_parts, rows, cols) of its map
+    soft: NDArray[np.bool_]  # patches that it makes soft, of the same shape
+    conditions: tuple[str, ...]  # the kind of condition that each part sets; empty where it sets none
 
     @property
     def patches(self) -> NDArray[np.bool_]:
@@ -109,17 +95,14 @@ class Effects:
         kind = CONDITIONS[name].cause if name else None
         if kind is None and self.patches[part].any() and self.way(part, half_width)[0] < _LEAST_HEIGHT:
             kind = SLIPPERY if self.slippery[part].any() else SOFT
-        if kind is None:
-            return measure_shape(self.heights[part], half_width)
-        return Shape(kind=kind, **{field.name: 0.0 for field in fields(Shape) if field.name != "kind"})
+        return Shape(kind=kind) if kind else measure_shape(self.heights[part], half_width)
 
 
 def describe_cause(cause: Mapping[str, Any] | None) -> str:
     """A cause with the values of its :class:`Shape`: ``ridge, 0.25 m high, 53 degrees steep``."""
     if cause is None:
         return UNCLEAR
-    kind = cause["kind"]
-    height = cause.get("height_m")
+    kind, height = cause["kind"], cause.get("height_m")
     if not height:
         return kind
     size = SHAPES[kind] or ("high" if height > 0.0 else "deep")
@@ -155,13 +138,10 @@ def find_causes(
 ) -> list[str]:
     """What stops robots that end at a place of each terrain: the kind of a :class:`Shape`, or :data:`UNCLEAR`.
 
-    It is the part which, alone on flat ground, has the largest difference of heights near that place. Where that is
-    under 3 cm it is slippery or soft ground, or unclear. How near was chosen on half of the elites in
-    results/ whose minimal terrain is known. On the other half it names the kind of the minimal terrain's cause in six
-    of ten, a part drawn at random in three of ten; in seven of ten if oblique kinds count as straight ones.
-
-    Genes have shape (N, num_genes). ``ends`` are world-local x and y of the places [m], shape (N, 2), NaN where they
-    are not known; ``half_width`` is that of the robot's stance [m].
+    It is the part which, alone on flat ground, has the largest difference of heights near that place; where that is
+    under 3 cm, slippery or soft ground. How near was chosen on half of the elites in results/ with minimal terrains. Of
+    the others it names the cause's kind in six of ten, in seven if oblique counts as straight; a random part in three.
+    Genes have shape (N, num_genes), ``ends`` are world-local x and y [m], (N, 2), NaN where they are not known.
     """
     return [_find_cause(*terrain, space, half_width) for terrain in zip(genes, ends, strict=True)]
 
@@ -216,16 +196,14 @@ def measure_shape(field: NDArray[np.float32], half_width: float) -> Shape:
     window = heights[:, max(first - near, 0) : first + near + 1]
     low = (window * np.sign(height) < abs(height) / 2).all(axis=1)
     low = np.pad(low, 1, constant_values=True)  # the grid's edge ends it
-    left = middle + int(low[middle + 1 :].argmax())
-    right = middle - int(low[middle + 1 :: -1].argmax())
     slopes = {"slope_deg": steepness, "along_deg": along, "across_deg": across}
     numbers = {
         "height_m": height,
         **{name: float(np.rad2deg(np.arctan(float(values[steepest])))) for name, values in slopes.items()},
         "oblique_deg": float(np.rad2deg(np.arctan2(abs(across[steepest]), abs(along[steepest])))),
         "length_m": SPACING * int((np.abs(ground[:, row]) >= abs(height) / 2).sum()) if height else 0.0,
-        "left_m": SPACING * (left - _CENTRE),
-        "right_m": SPACING * (_CENTRE - right),
+        "left_m": SPACING * (middle + int(low[middle + 1 :].argmax()) - _CENTRE),
+        "right_m": SPACING * (_CENTRE - middle + int(low[middle + 1 :: -1].argmax())),
     }
     return Shape(kind=_classify(numbers), **{name: round(value, 3) for name, value in numbers.items()})
 

@@ -1,7 +1,7 @@
 """The elites of an archive by what is known best of each, in groups and in orders to show them in.
 
-Kin are terrains so much alike that they are not independent of each other. Families are kin of kin; distinct terrains
-are no kin of one another. A cause groups failing elites on which parts of one kind stop the robot, such as ridges.
+Kin are terrains so much alike that they are not independent. Families are kin of kin; distinct terrains are no kin. A
+cause groups failing elites on which parts of one kind stop the robot, such as ridges.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,13 +28,8 @@ from sim.terrains.spaces.base import ShippedSpace, TerrainSpace
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.spaces.wider import WiderSpace
 
-VERDICTS = ("", "failing", "certified", "confirmed", "fault")
-"""From the least to the most. The controller may cross with contact resolved what is certified alone."""
-KIN_M = 0.06
-"""Terrains whose heights differ by less (root mean square) are kin [m], in a space whose bumps are up to 0.25 m high.
-
-Of 850 hard-random terrains no two are.
-"""
+VERDICTS = ("", "failing", "certified", "confirmed", "fault")  # from the least to the most
+KIN_M = 0.06  # terrains of bumps up to 0.25 m are kin if their heights differ by less (RMS) [m]: no two random ones
 _KIN_SHARE = 0.25  # of a condition's range
 _EVERY = 2  # nodes; distances are compared at 0.1 m
 _BANK = 50  # height maps that are made at once
@@ -63,21 +58,13 @@ def find_verdicts(archive: Archive) -> NDArray[np.int64]:
 class Ranking(Evaluation):
     """N elites by what is known best of each: values of fresh episodes where valid ones exist, else as found."""
 
-    numbers: NDArray[np.int64]
-    """Number of each elite in the archive, shape (N,), ascending."""
-    is_fresh: NDArray[np.bool_]
-    """Whether the values are of fresh episodes, shape (N,)."""
-    verdict: NDArray[np.int64]
-    """Index in :data:`VERDICTS`, shape (N,). Without fresh episodes those that found an elite say whether it fails."""
-    causes: tuple[str, ...]
-    """What stops the robot on each: the cause of its minimal terrain, else that of the place where its typical episode
-    ends (:func:`qd.faults.causes.find_causes`). Empty where the elite does not fail."""
-    families: NDArray[np.int64]
-    """Family of each, shape (N,), numbered from 1 by its worst member."""
-    asks: Kind = Kind.CROSS
-    """What robots are asked for."""
-    log_likelihood: NDArray[np.float64] | None = None
-    """Of the conditions of each (:func:`sim.terrains.conditions.likely.find_log_likelihood`), shape (N,), if known."""
+    numbers: NDArray[np.int64]  # number of each elite in the archive, shape (N,), ascending
+    is_fresh: NDArray[np.bool_]  # whether the values are of fresh episodes, shape (N,)
+    verdict: NDArray[np.int64]  # index in VERDICTS, shape (N,); without fresh episodes by those that found it
+    causes: tuple[str, ...]  # by the minimal terrain, else the typical episode; empty where the robot does not fail
+    families: NDArray[np.int64]  # family of each, shape (N,), numbered from 1 by its worst member
+    asks: Kind = Kind.CROSS  # what robots are asked for
+    log_likelihood: NDArray[np.float64] | None = None  # of the conditions of each, shape (N,), if known
 
     @property
     def orders(self) -> dict[str, str]:
@@ -147,8 +134,7 @@ class Ranking(Evaluation):
             values = self.families if by == "family" else np.asarray(getattr(self, by))
             sign = 1 if by in ("family", "goal_rate") else -1
             return severity[np.argsort(sign * values[severity], kind="stable")]
-        families = self.families.tolist()
-        leading: dict[int, int] = {}  # families by row
+        families, leading = self.families.tolist(), dict[int, int]()  # leading families by row
         for rows in self.by_cause().values():
             leader = next((row for row in rows.tolist() if families[row] not in leading.values()), int(rows[0]))
             leading[leader] = families[leader]
@@ -175,16 +161,14 @@ def rank(
 ) -> Ranking:
     """The ranking of an archive that has elites.
 
-    Minimal terrains say best what the cause is. ``half_width`` is that of the robot's stance [m]. ``judged`` leaves out
-    elites with invalid fresh episodes; ``numbers`` are elites to rank alone. ``likely`` says how conditions are
-    distributed.
+    Minimal terrains say best what the cause is. ``judged`` leaves out elites with invalid fresh episodes; ``numbers``
+    are elites to rank alone. ``likely`` says how conditions are distributed.
     """
-    values, is_fresh = best_values(archive)
     chosen = np.arange(len(archive)) if numbers is None else np.array(numbers, np.int64)
     if judged and archive.fresh is not None:
-        chosen = chosen[is_fresh[chosen]]
-    values = {name: value[chosen] for name, value in values.items()}
+        chosen = chosen[archive.fresh.valid[chosen]]
     archive = archive.rows(chosen)
+    values, is_fresh = best_values(archive)
     families = find_families(archive.genes, space) if archive.family is None else archive.family
     causes = find_failing_causes(archive, space, half_width) if archive.cause is None else archive.cause
     entries = minima.numbers["elites"] if minima else []
@@ -193,7 +177,7 @@ def rank(
     ranking = Ranking(
         **values,
         numbers=chosen,
-        is_fresh=is_fresh[chosen],
+        is_fresh=is_fresh,
         verdict=np.maximum(find_verdicts(archive), values["goal_rate"] < FAILING_GOAL_RATE),
         causes=tuple(cause and minimal_causes.get(number, cause) for number, cause in known),
         families=families,
@@ -226,10 +210,7 @@ def find_failing_causes(archive: Archive, space: TerrainSpace, half_width: float
 
 
 def find_families(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.int64]:
-    """Number of the family of each terrain, from 0 in the order of its first member, shape (N,).
-
-    Kin of kin are one family. Genes have shape (N, num_genes).
-    """
+    """Family of each terrain, kin of kin, by genes (N, num_genes): (N,), from 0 in the order of first members."""
     _, families = connected_components(kin_distances(genes, space) < 1.0, directed=False)
     return families.astype(np.int64)
 
@@ -245,35 +226,28 @@ def pick_distinct(distances: NDArray[np.float64], least: float = 1.0) -> NDArray
 def judged_numbers(
     archive: Archive, space: TerrainSpace, likely: Mapping[str, Disturbance] | None = None
 ) -> dict[str, Any]:
-    """The numbers of faults (:func:`fault_numbers`), how many failing elites and faults are distinct, and which likely.
-
-    ``likely`` says how conditions are distributed, if that is known.
-    """
+    """The numbers of faults, how many are distinct, and where distributions of conditions are known, the likeliest."""
     numbers = fault_numbers(archive)
     distances = kin_distances(archive.genes[archive.failing], space)
     faults = archive.is_fault[archive.failing]
-    known = {"failing": numbers["failing"] is not None, "faults": numbers["faults_panel"] is not None}
-    for name, some in (("failing", distances), ("faults", distances[faults][:, faults])):
-        numbers[f"{name}_distinct"] = int(pick_distinct(some).sum()) if known[name] else None
+    for name, known, some in (
+        ("failing", numbers["failing"], distances),
+        ("faults", numbers["faults_panel"], distances[faults][:, faults]),
+    ):
+        numbers[f"{name}_distinct"] = None if known is None else int(pick_distinct(some).sum())
     if likely:
         values = find_log_likelihood(space.condition_rows(archive.genes), likely)
-        chosen = {"failing": archive.failing, "faults": archive.is_fault}
-        numbers["likeliest"] = {name: _find_likeliest(values, some) for name, some in chosen.items()}
+        numbers["likeliest"] = likeliest = dict[str, dict[str, Any] | None]()
+        for name, some in (("failing", archive.failing), ("faults", archive.is_fault)):
+            elite = max(np.flatnonzero(some & np.isfinite(values)).tolist(), key=values.__getitem__, default=None)
+            likeliest[name] = None if elite is None else {"elite": elite, "log_likelihood": float(values[elite])}
     return numbers
-
-
-def _find_likeliest(log_likelihood: NDArray[np.float64], chosen: NDArray[np.bool_]) -> dict[str, Any] | None:
-    """Number and log-likelihood of the likeliest of some elites, (N,); None where all are ruled out."""
-    values = np.where(chosen, log_likelihood, -np.inf)
-    elite = int(values.argmax()) if len(values) else 0
-    return {"elite": elite, "log_likelihood": float(values[elite])} if np.isfinite(values).any() else None
 
 
 def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np.float64]:
     """Distances of terrains, genes of shape (N, num_genes), to each other, shape (N, N); below 1 they are kin.
 
-    A distance is the larger of two: the heights' over :data:`KIN_M`, which is scaled to the space, and the largest
-    change of a condition's number over a quarter of its range.
+    The larger of two: heights' over :data:`KIN_M`, scaled to the space, and a condition's over a quarter of its range.
     """
     if not len(genes):
         return np.zeros((0, 0))
@@ -287,10 +261,7 @@ def kin_distances(genes: NDArray[np.float32], space: TerrainSpace) -> NDArray[np
 
 @cache
 def height_over_paper(space: TerrainSpace) -> float:
-    """Height of a space without ground and conditions over 0.25 m, the height of the paper's.
-
-    Of a user's space, which has none, the root mean square height of random terrains over that of the paper's.
-    """
+    """Height of a space without ground and conditions over the paper's, of a user's by the RMS of random terrains."""
     if isinstance(space, ShippedSpace):
         return space.height_share
     user, paper = (each.hard_random(_BANK, 0) for each in (space, SUPER_GAUSSIAN))

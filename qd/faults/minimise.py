@@ -1,9 +1,8 @@
 """Minimal terrains: the fewest parts of a failing terrain on which the controller still fails, and which is the cause.
 
-A terrain has parts, such as bumps. Robots cross some of its parts alone, 20 episodes each; a subset fails if under half
-of them reach the goal. A minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes check
-it. Pushes come as late as they still make it fail. Then its heights are scaled down together as long as it still fails.
-Minimal terrains are judged like elites.
+Robots cross some of a terrain's parts alone, 20 episodes each; a subset fails if under half of them reach the goal. A
+minimal terrain is a failing subset of which no smaller subset fails; 40 fresh episodes check it. Pushes come as late as
+they still make it fail. Then its heights are scaled down together as long as it still fails.
 """
 
 import math
@@ -17,20 +16,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from qd.faults import numbers as faults
 from qd.faults.causes import find_effects
 from qd.faults.families import VERDICTS, find_verdicts
 from qd.faults.judge import STAGES, Judging, elite_seeds, open_judging
-from qd.faults.numbers import (
-    EPISODES,
-    FRESH_EPISODES,
-    MINIMAL_FILE,
-    MINIMAL_NUMBERS_FILE,
-    MinimalTerrains,
-    fresh_counts,
-    judgement,
-    rate_numbers,
-    read_minimal,
-)
 from qd.faults.searches import Search, find_search
 from qd.search.archive import OUTCOMES, Archive, goal_rates, no_outcomes
 from qd.search.fitness import FAILING_GOAL_RATE
@@ -44,57 +33,44 @@ from sim.terrains.bank import make_heights
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.terrains import Terrains
 
-MAX_PARTS = 10
-"""Parts of a terrain whose subsets, 1,024 at most, are all crossed if need be."""
+FIGURE_FILE = "minimal.png"
+MAX_PARTS = 10  # parts of a terrain whose subsets, 1,024 at most, are all crossed if need be
 _MOMENTS = 8  # at equal distances, from which the latest of a push is chosen
 _SCALE_STEPS = 5  # halvings of the interval that holds the least scale which still fails: it is known to 1/32
 _LEAST_EFFECT_M = 1e-4  # a part that changes no height by more is none
 _ROW_EPISODES = 5  # of a row of genes; the episodes of a trial are spread over workers by rows
 
 How = Literal["exhaustive", "greedy"]
-Parts = tuple[int, ...]
-"""Numbers of some parts of a terrain, rising."""
+Parts = tuple[int, ...]  # numbers of some parts of a terrain, rising
 
 
 class Trial(NamedTuple):
     """Some parts of a terrain, to be crossed."""
 
     parts: Parts
-    scale: float = 1.0
-    """What their heights are multiplied by."""
-    moments: tuple[tuple[int, float], ...] = ()
-    """When some parts come that come at some time [s], if not as in the terrain."""
-    fresh: bool = False
-    """Whether to cross in 40 episodes, with other seeds than the 20 by which a subset is found."""
+    scale: float = 1.0  # what their heights are multiplied by
+    moments: tuple[tuple[int, float], ...] = ()  # when some parts come [s], if not as in the terrain
+    fresh: bool = False  # whether to cross in 40 episodes, with other seeds than the 20 by which a subset is found
 
     @property
     def rows(self) -> int:
         """Rows of genes that its episodes take."""
-        return (FRESH_EPISODES if self.fresh else EPISODES) // _ROW_EPISODES
+        return (faults.FRESH_EPISODES if self.fresh else faults.EPISODES) // _ROW_EPISODES
 
 
 @dataclass(kw_only=True)
 class Case:
     """A failing terrain that is taken apart; outcomes are by :data:`qd.search.archive.OUTCOMES`, shape (4,)."""
 
-    parts: Parts
-    """Parts that change it, in the order in which they are taken away."""
-    how: How
-    """Exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time."""
-    flat: Parts = ()
-    """Parts without heights to scale: slippery patches, conditions. A terrain of these alone is not scaled."""
-    counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)
-    """Outcomes of each trial; those of all parts together, the elite's fresh ones, are there from the start."""
-    minimal: Parts = ()
-    """Parts that it takes to fail, once it was taken apart."""
-    later: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    """When parts come that come at some time, and the latest that they can [s], by part."""
-    moments: tuple[tuple[int, float], ...] = ()
-    """The latest at which parts of the minimal terrain come while it fails, where that is later than they do [s]."""
-    scale: float | None = None
-    """Least scale of their heights that was crossed and fails; None if they cannot be scaled."""
-    passing_scale: float | None = None
-    """Largest scale below it that was crossed and does not fail; None if there is none."""
+    parts: Parts  # parts that change it, in the order in which they are taken away
+    how: How  # exhaustive: subsets are crossed from the smallest on. Greedy: parts are taken away one at a time
+    flat: Parts = ()  # parts without heights to scale: patches of ground, conditions; these alone are not scaled
+    counts: dict[Trial, NDArray[np.int64]] = field(default_factory=dict)  # outcomes of each trial
+    minimal: Parts = ()  # parts that it takes to fail, once it was taken apart
+    later: Mapping[int, tuple[float, float]] = field(default_factory=dict)  # when a part comes, and at the latest [s]
+    moments: tuple[tuple[int, float], ...] = ()  # the latest at which parts come while it fails, if later [s]
+    scale: float | None = None  # least scale of their heights that was crossed and fails; None if they cannot be scaled
+    passing_scale: float | None = None  # largest scale below it that was crossed and does not fail, if any
 
     @property
     def whole(self) -> Parts:
@@ -127,8 +103,7 @@ class Case:
         return max(rates, key=lambda part: (np.nan_to_num(rates[part], nan=-1.0), rank[part]), default=None)
 
 
-Steps = Generator[list[Trial], None, Any]
-"""Yields trials to be crossed; their outcomes are in the counts of the case when it goes on."""
+Steps = Generator[list[Trial], None, Any]  # yields trials to cross; then their outcomes are in the case
 
 
 def find_minimal(case: Case) -> Steps:
@@ -137,24 +112,19 @@ def find_minimal(case: Case) -> Steps:
     case.moments = yield from _find_latest(case)
     if set(case.minimal) <= set(case.flat):
         return
-    passing = 0.0
-    failing = 1.0
+    case.scale, passing = 1.0, 0.0
     for _ in range(_SCALE_STEPS):
-        trial = Trial(case.minimal, scale=(passing + failing) / 2, moments=case.moments)
+        trial = Trial(case.minimal, scale=(passing + case.scale) / 2, moments=case.moments)
         yield from _missing(case, trial)
         if case.fails(trial):
-            failing = trial.scale
+            case.scale = trial.scale
         else:
             passing = trial.scale
-    case.scale = failing
     case.passing_scale = passing or None
 
 
 def _find_latest(case: Case) -> Steps:
-    """The latest moments of parts at which the minimal terrain still fails, one part after another.
-
-    They count if 40 fresh episodes fail there, too, and no part can be taken away there.
-    """
+    """The latest moments at which the terrain still fails, in fresh episodes too, and no part can be left out."""
     moments = ()
     for part, (time_s, latest) in case.later.items():
         if part in case.minimal:
@@ -245,15 +215,12 @@ def open_case(
         how=how or ("exhaustive" if on_gpu and len(parts) <= MAX_PARTS else "greedy"),
         flat=tuple(part for part in parts if not scalable or np.abs(effects.heights[part]).max() <= _LEAST_EFFECT_M),
         later=space.moments(genes),
-        counts={Trial(tuple(parts), fresh=True): fresh_counts(archive, number)},
+        counts={Trial(tuple(parts), fresh=True): faults.fresh_counts(archive, number)},
     )
 
 
 def take_apart(archive: Archive, cases: Mapping[int, Case], judging: Judging) -> None:
-    """Finds the minimal terrains of some elites, all of them together, by number of the elite.
-
-    All subsets of an elite are crossed from the same starts, fresh episodes from others.
-    """
+    """Finds the minimal terrains of some elites, by number, all together; subsets of one have the same starts."""
     search = judging.search
     seeds = {}
     for fresh, stream in ((False, Stream.MINIMISED), (True, Stream.MINIMISED_FRESH)):
@@ -274,9 +241,6 @@ def take_apart(archive: Archive, cases: Mapping[int, Case], judging: Judging) ->
             cases[number].counts[trial] = counts.sum(axis=0)
 
 
-FIGURE_FILE = "minimal.png"
-
-
 def minimise(
     run: Path,
     *,
@@ -288,13 +252,12 @@ def minimise(
     robot: str | None = None,
     policy: str | None = None,
     space: str | None = None,
-) -> MinimalTerrains | None:
+) -> faults.MinimalTerrains | None:
     """Finds minimal terrains of failing elites of a run and writes them beside those that it has of other elites.
 
-    Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first, then
-    confirmed, certified and other failing ones. They must have fresh episodes. ``judged`` says whether the minimal
-    terrains are crossed with contact resolved and by certifiers too; all else is as :func:`qd.faults.judge.judge` takes
-    it. Returns what the run has now; None without a failing elite.
+    Elites are named by numbers, or ``all``; by default they are 200 on a GPU and 3 on the CPU, faults first. With
+    ``judged`` minimal terrains are crossed with contact resolved and by certifiers. Returns what the run has now; None
+    without a failing elite.
     """
     search = find_search(run, robot=robot, policy=policy, space=space)
     with open_judging(search, compute, certifiers, ask=judged) as judging:
@@ -311,11 +274,11 @@ def minimise(
             print(f"{run}: none of {len(archive):,} elites fails.")
         verdicts = [VERDICTS[verdict] for verdict in find_verdicts(elites)]
         entries = {
-            n: _entry(archive, n, cases[n], search) | {"verdict": verdicts[row], **judgement(elites, row)}
+            n: _entry(archive, n, cases[n], search) | {"verdict": verdicts[row], **faults.judgement(elites, row)}
             for row, n in enumerate(numbers)
         }
         genes = dict(zip(numbers, elites.genes, strict=True))
-        if stored := read_minimal(run, archive):
+        if stored := faults.read_minimal(run, archive):
             entries = {entry["elite"]: entry for entry in stored.numbers["elites"]} | entries
             genes = stored.genes | genes
         if not entries:
@@ -324,24 +287,22 @@ def minimise(
     for number in numbers:
         verdict = f"; {entries[number]['verdict']}" if judged else ""
         print(f"Elite {number}: {result.describe(number)}{verdict}.")
-    print(f"Numbers: {run / MINIMAL_NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
+    print(f"Numbers: {run / faults.MINIMAL_NUMBERS_FILE}\nFigure: {run / FIGURE_FILE}")
     return result
 
 
-def _write(
-    judging: Judging, entries: Mapping[int, dict[str, Any]], genes: Mapping[int, NDArray[np.float32]]
-) -> MinimalTerrains:
+def _write(judging: Judging, entries: dict[int, dict[str, Any]], genes: dict[int, Any]) -> faults.MinimalTerrains:
     search = judging.search
-    ordered = [entries[number] for number in sorted(entries)]
     genes = {number: genes[number] for number in sorted(entries)}
+    ordered = [entries[number] for number in genes]
     space = {"space": search.cfg.space, "space_sha256": search.cfg.space_sha256}
     content = {**judging.origin, **space, **_totals(ordered), "elites": ordered}
     arrays = {name: np.array(value) for name, value in space.items() if value is not None}
     arrays |= {"elite": np.array([*genes]), "genes": np.array([*genes.values()])}
-    write_atomically(search.run / MINIMAL_FILE, npz_bytes(arrays))
-    write_atomically(search.run / MINIMAL_NUMBERS_FILE, to_json(content))
+    write_atomically(search.run / faults.MINIMAL_FILE, npz_bytes(arrays))
+    write_atomically(search.run / faults.MINIMAL_NUMBERS_FILE, to_json(content))
     save_figure(search.run / FIGURE_FILE, draw_minimal(search.cfg.robot, content, genes, search.space))
-    return MinimalTerrains(numbers=content, genes=genes)
+    return faults.MinimalTerrains(numbers=content, genes=genes)
 
 
 def _choose_failing(archive: Archive, elite: str | None, search: Search, *, max_elites: int) -> list[int]:
@@ -386,7 +347,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
     shapes = {part: effects.shape(index, search.robot.half_width) for index, part in enumerate(case.minimal)}
     cause = case.cause({part: abs(shape.height_m) for part, shape in shapes.items()})
     whole, scaled = make_heights(np.array(genes), space)
-    without = {str(part): rate_numbers(counts) for part, counts in case.without.items()}
+    without = {str(part): faults.rate_numbers(counts) for part, counts in case.without.items()}
     subsets = {trial.parts for trial in case.counts if trial.scale == 1.0 and trial.parts != case.whole}
     scaled_counts = {trial.scale: counts for trial, counts in case.counts.items() if trial.scale < 1.0}
     return {
@@ -398,7 +359,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
         "of": len(case.parts),
         "how": case.how,
         "subsets_crossed": len(subsets),
-        **rate_numbers(case.fresh),
+        **faults.rate_numbers(case.fresh),
         "without": {part: rate["goal_rate"] for part, rate in without.items()},
         "without_intervals": {part: rate["goal_interval"] for part, rate in without.items()},
         "cause": None if cause is None else {"bump": cause, **asdict(shapes[cause])},
@@ -406,7 +367,7 @@ def _entry(archive: Archive, number: int, case: Case, search: Search) -> dict[st
         "passing_scale": case.passing_scale,
         "height_m": round(float(np.abs(whole).max()), 4),
         "margin_m": None if case.scale is None else round(float(np.abs(whole - scaled).max()), 4),
-        "scales": [{"scale": scale, **rate_numbers(scaled_counts[scale])} for scale in sorted(scaled_counts)],
+        "scales": [{"scale": scale, **faults.rate_numbers(scaled_counts[scale])} for scale in sorted(scaled_counts)],
     }
 
 
@@ -417,7 +378,6 @@ def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
     causes = Counter(entry["cause"]["kind"] for entry in entries if entry["cause"])
     verdicts = Counter(entry["verdict"] for entry in entries)
     judged = any(entry["resolved"] for entry in entries)
-    certifiers = {certificate["controller"] for entry in entries for certificate in entry["certificates"]}
     return {
         "minimal": len(entries),
         "bumps_histogram": {str(size): count for size, count in sorted(Counter(sizes).items())},
@@ -427,5 +387,5 @@ def _totals(entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "confirmed": verdicts["confirmed"] + verdicts["fault"] if judged else None,
         "certified": verdicts["certified"] + verdicts["fault"] if judged else None,
         "faults": verdicts["fault"] if judged else None,
-        "certifiers": sorted(certifiers),
+        "certifiers": sorted({row["controller"] for entry in entries for row in entry["certificates"]}),
     }

@@ -19,20 +19,18 @@ from sim.files.npz import read_arrays
 from sim.files.templates import open_templates
 from sim.rates import SUCCESS
 
-FRESH_EPISODES = 40
-"""Episodes that each elite is evaluated again with."""
-EPISODES = 20
-"""Episodes of an elite in each further stage of judging."""
-SEARCHED = "searched"
-"""Name of the searched controller among those that are steered."""
-SPECIALIST = "specialist"
-"""Name of the certifier that was trained for one search, on its failing elites; all others form the panel."""
+FRESH_EPISODES = 40  # episodes that each elite is evaluated again with
+EPISODES = 20  # episodes of an elite in each further stage of judging
+SEARCHED = "searched"  # name of the searched controller among those that are steered
+SPECIALIST = "specialist"  # certifier that was trained on the failing elites of one search; all others form the panel
 
-TEMPLATES = open_templates(Path(__file__).parent / "templates")
-"""Texts about elites."""
+TEMPLATES = open_templates(Path(__file__).parent / "templates")  # texts about elites
 _INVALID = OUTCOMES.index("invalid")
-MAX_FALSE_DISCOVERIES = 0.05
-"""Largest expected share of luck among what is significant (Benjamini and Hochberg 1995)."""
+MAX_FALSE_DISCOVERIES = 0.05  # largest expected share of luck among what is significant (Benjamini and Hochberg 1995)
+_COUNTS = (
+    "confirmed", "certified", "faults", "faults_panel", "faults_controllers", "faults_witness", "fault_families",
+    "fault_families_controllers", "strong", "faults_fdr",
+)  # fmt: skip
 _KINDS = {"searched": "", "resolved": " with contact resolved", "varied": " under varied conditions"}
 FURTHER_NUMBERS = ("witnesses", "crossed_varied", "robust", "faults_mujoco_c", "likeliest")
 """Numbers of faults that an archive has only if they were crossed again, or its space has conditions."""
@@ -85,69 +83,61 @@ def fresh_numbers(archive: Archive, fresh: FreshValues) -> dict[str, Any]:
 
 def fault_numbers(archive: Archive) -> dict[str, Any]:
     """The numbers of faults, as ``archive.json`` has them; None where nobody knows."""
-    failing, families = archive.failing, archive.family
-    names = archive.certifiers
-    parts = ("faults", "faults_panel", "faults_controllers", "faults_witness")
-    kinds = ("fault_families", "fault_families_controllers")
-    counts = ("confirmed", "certified", *parts, *kinds, "strong", "faults_fdr")
+    failing, names, witnesses = archive.failing, archive.certifiers, archive.witnesses
+
+    def count_families(rows: NDArray[np.bool_]) -> int | None:
+        return None if archive.family is None else len(np.unique(archive.family[rows]))
+
     numbers: dict[str, Any] = {
         "failing": None if archive.fresh is None else int(failing.sum()),
-        **dict.fromkeys(counts, 0 if archive.fresh is not None and not failing.any() else None),
-        "families": None if families is None else len(np.unique(families)),
-        "failing_families": None if families is None else len(np.unique(families[failing])),
+        **dict.fromkeys(_COUNTS, 0 if archive.fresh is not None and not failing.any() else None),
+        "families": count_families(np.ones(len(archive), bool)),
+        "failing_families": count_families(failing),
         "certifiers": list(names),
     }
     if not archive.is_judged or not failing.any():
         return numbers
     resolved = failing & archive.resolved_outcomes.any(axis=1)
     certificates = archive.certificates & failing[:, None]
-    numbers["crossed_resolved"] = int(resolved.sum())
-    numbers["certificates"] = [
-        {
-            "controller": name,
-            "policy_sha256": digest,
-            "crossed": int((archive.certifier_outcomes[:, column].any(axis=1) & failing).sum()),
-            "certified": int(certificates[:, column].sum()),
-        }
-        for column, (name, digest) in enumerate(zip(names, archive.certifier_sha256, strict=True))
-    ]
+    counts = {"crossed_resolved": resolved}
     if resolved.any():
-        numbers["confirmed"] = int(archive.confirmed.sum())
-    if (witnesses := archive.witnesses) is not None:
+        counts["confirmed"] = archive.confirmed
+    crossed = archive.certifier_outcomes.any(axis=2) & failing[:, None]
+    columns = (names, archive.certifier_sha256, crossed.sum(axis=0).tolist(), certificates.sum(axis=0).tolist())
+    keys = ("controller", "policy_sha256", "crossed", "certified")
+    numbers["certificates"] = [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
+    if witnesses is not None:
         tried = witnesses.walker != ""
         found = {name: int((witnesses.kind == kind).sum()) for kind, name in enumerate(WITNESSES) if name}
         own = int((witnesses.on_line & (witnesses.walker == SEARCHED)).sum())
         numbers["witnesses"] = {"tried": int(tried.sum()), **found, "own_line": own, "limit_m": witnesses.limit_m}
     if names or witnesses is not None:
-        numbers["certified"] = int(archive.certified.sum())
+        counts["certified"] = archive.certified
     if (names or witnesses is not None) and resolved.any():
         in_panel = np.array(names, np.str_) != SPECIALIST
         is_fault, by_controllers = archive.is_fault, archive.certified_by_controllers
-        numbers["faults"] = None if in_panel.all() and witnesses is None else int(is_fault.sum())
-        numbers["faults_panel"] = int((is_fault & certificates[:, in_panel].any(axis=1)).sum())
-        numbers["faults_controllers"] = int((is_fault & by_controllers).sum())
-        numbers["faults_witness"] = None if witnesses is None else int((is_fault & ~by_controllers).sum())
-        numbers["strong"] = int(archive.strong.sum())
-        numbers["faults_fdr"] = int((is_fault & find_significant(archive)).sum())
-        if families is not None:
-            numbers["fault_families"] = len(np.unique(families[is_fault]))
-            numbers["fault_families_controllers"] = len(np.unique(families[is_fault & by_controllers]))
+        counts |= {} if in_panel.all() and witnesses is None else {"faults": is_fault}
+        counts |= {} if witnesses is None else {"faults_witness": is_fault & ~by_controllers}
+        counts["faults_panel"] = is_fault & certificates[:, in_panel].any(axis=1)
+        counts["faults_controllers"] = is_fault & by_controllers
+        counts |= {"strong": archive.strong, "faults_fdr": is_fault & find_significant(archive)}
+        numbers["fault_families"] = count_families(is_fault)
+        numbers["fault_families_controllers"] = count_families(is_fault & by_controllers)
         if archive.varied is not None:
-            numbers["crossed_varied"] = int((is_fault & archive.varied.searched.any(axis=1)).sum())
-            numbers["robust"] = int(archive.robust.sum())
+            counts["crossed_varied"] = is_fault & archive.varied.searched.any(axis=1)
+            counts["robust"] = archive.robust
         if archive.mujoco_c is not None:
             tried = is_fault & archive.mujoco_c.searched.any(axis=1)
-            numbers["faults_mujoco_c"] = _share_held(archive, tried)
-            numbers["faults_mujoco_c"]["strong"] = _share_held(archive, tried & archive.strong)
-    return numbers
+            strong = _share_held(archive, tried & archive.strong)
+            numbers["faults_mujoco_c"] = _share_held(archive, tried) | {"strong": strong}
+    return numbers | {name: int(mask.sum()) for name, mask in counts.items()}
 
 
 def find_significant(archive: Archive) -> NDArray[np.bool_]:
     """Whether it is no luck that a certifier crosses a failing elite more often than the searched controller, (N,).
 
-    Fisher's exact test, one-sided, compares the searched controller's episodes with contact resolved with a certifier's
-    of both kinds. The worse p counts, and of C certifiers the smallest p times C. Benjamini and Hochberg's procedure
-    holds the share of false discoveries among the failing elites at 5 %.
+    By Fisher's exact test, one-sided, against both kinds of a certifier's episodes: the worse p, and of C certifiers
+    the smallest p times C. Benjamini and Hochberg's procedure holds the share of false discoveries at 5 %.
     """
     both = np.stack([archive.certifier_outcomes, archive.certifier_resolved_outcomes])
     others = archive.resolved_outcomes[:, None]
@@ -218,12 +208,10 @@ def describe_judgement(archive: Archive, number: int) -> list[str]:
     witness = describe_witness(archive, number)
     if not rates and not witness:
         return []
-    known: dict[str, Any] = {"rates": rates, "witness": witness, "success": SUCCESS[archive.terrain_space.asks]}
-    known["passers"] = [*compress(archive.certifiers, archive.certificates[number].tolist())]
-    known |= {name: getattr(archive, name)[number] for name in ("failing", "confirmed", "robust", "holds_in_mujoco_c")}
-    known["in_mujoco_c"] = archive.mujoco_c is not None and archive.mujoco_c.searched[number].any()
-    known["on_line"] = archive.witnesses is not None and archive.witnesses.on_line[number]
-    return TEMPLATES.get_template("elite.txt").render(known).splitlines()
+    passers = [*compress(archive.certifiers, archive.certificates[number].tolist())]
+    about = {"archive": archive, "number": number, "success": SUCCESS[archive.terrain_space.asks]}
+    about |= {"rates": rates, "witness": witness, "passers": passers}
+    return TEMPLATES.get_template("elite.txt").render(about).splitlines()
 
 
 def describe_witness(archive: Archive, number: int) -> str:
@@ -270,8 +258,7 @@ def rate_numbers(counts: NDArray[np.int64]) -> dict[str, Any]:
 def judgement(archive: Archive, number: int) -> dict[str, Any]:
     """What is known of an elite under other conditions, as JSON values; None where nobody looked.
 
-    ``resolved`` is the rate with contact resolved, ``varied`` under varied conditions. ``certificates`` has name and
-    hash of each controller that certifies it, and its rates at the ``searched`` settings and under the same conditions.
+    ``certificates`` has each certifier's name, hash, and rates at the search's settings and under these conditions.
     """
     resolved = archive.resolved_outcomes[number]
     varied = None if archive.varied is None else archive.varied.searched[number]
@@ -291,10 +278,8 @@ def judgement(archive: Archive, number: int) -> dict[str, Any]:
 class MinimalTerrains:
     """Minimal terrains of elites of an archive."""
 
-    numbers: dict[str, Any]
-    """The content of ``minimal.json``."""
-    genes: dict[int, NDArray[np.float32]]
-    """By number of the elite, each of shape (num_genes,)."""
+    numbers: dict[str, Any]  # the content of minimal.json
+    genes: dict[int, NDArray[np.float32]]  # by number of the elite, each of shape (num_genes,)
 
     def entry(self, number: int) -> dict[str, Any]:
         """The entry of an elite in ``minimal.json``."""
@@ -315,8 +300,7 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
     try:
         numbers = read_json(file)
         arrays = read_arrays(folder / MINIMAL_FILE, ("elite", "genes"))
-        entries = numbers["elites"]
-        genes = arrays["genes"]
+        entries, genes = numbers["elites"], arrays["genes"]
         shape = (len(entries), archive.genes.shape[1])
         if [entry["elite"] for entry in entries] != arrays["elite"].tolist() or genes.shape != shape:
             raise ValueError(f"{MINIMAL_NUMBERS_FILE} and {MINIMAL_FILE} are not of one another")
@@ -327,9 +311,8 @@ def read_minimal(folder: Path, archive: Archive) -> MinimalTerrains | None:
         what = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"{rule}: {what}: remove both, or run `faultline minimise` again") from None
     # A search that went on may have found others of these numbers.
-    names = list(zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True))
-    rows = [row for row, entry in enumerate(entries) if (entry["elite"], entry["cell"], entry["iteration"]) in names]
-    if not rows:
-        return None
-    genes_by_elite = {entries[row]["elite"]: genes[row] for row in rows}
-    return MinimalTerrains(numbers=numbers | {"elites": [entries[row] for row in rows]}, genes=genes_by_elite)
+    names = [*zip(range(len(archive)), archive.cell.tolist(), archive.iteration.tolist(), strict=True)]
+    named = [(entry["elite"], entry["cell"], entry["iteration"]) in names for entry in entries]
+    numbers["elites"] = [*compress(entries, named)]
+    genes_by_elite = {entry["elite"]: row for entry, row in zip(numbers["elites"], genes[named], strict=True)}
+    return MinimalTerrains(numbers=numbers, genes=genes_by_elite) if any(named) else None

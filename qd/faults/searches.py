@@ -15,8 +15,7 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.spaces.registry import load_space
 
-CERTIFIERS_FOLDER = "certifiers"
-"""Folder of a run that holds certifiers trained for it, ``<name>.pt``."""
+CERTIFIERS_FOLDER = "certifiers"  # folder of a run that holds certifiers trained for it, <name>.pt
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +25,7 @@ class Search:
     run: Path
     cfg: SearchCfg
     robot: RobotCfg
-    policy: str
-    """The controller that was searched, as :func:`sim.controllers.loaders.load_policy` takes it."""
+    policy: str  # the controller that was searched, as sim.controllers.loaders.load_policy takes it
     space: TerrainSpace
 
     def read_archive(self) -> Archive:

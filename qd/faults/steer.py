@@ -26,8 +26,7 @@ from sim.robots.robot import RobotCfg
 from sim.rollout import RolloutResult
 from sim.terrains.terrains import Terrains
 
-LINE_M, BESIDE_M = 0.5, 1.0
-"""A way is on the line, or beside it, where the robot is never further from the straight line [m]."""
+LINE_M, BESIDE_M = 0.5, 1.0  # on the line, and beside it, a robot is never further from the straight line [m]
 _LINE_EPISODES = 5  # of a terrain, to see how far plain crossings are from the line
 
 
@@ -37,26 +36,16 @@ class SteerCfg:
 
     generations: int = 12
     samples: int = EPISODES
-    best: int = 5
-    """Samples that the next generation is drawn near."""
-    step: float = 0.7
-    """How far the distribution moves toward that of the best samples, as a share."""
-    speed_std: float = 0.3
-    """Of the first generation [m/s]."""
-    offset_std: float = 0.4
-    """[m]; four times as much where no limit holds."""
-    heading_std: float = 0.5
-    """[rad]"""
-    least_std: float = 0.05
-    """Of any generation, of all three."""
-    common: float = 0.5
-    """Share of the variance that all segments of a sample have in common."""
-    smooth: float = 1.5
-    """Reach of the correlation of the rest [segments]."""
-    margin_m: float = 0.05
-    """By which ways stay within the limit [m]."""
-    beyond_cost: float = 20.0
-    """Of a metre beyond that, where a metre that is missing to the goal costs 1."""
+    best: int = 5  # samples that the next generation is drawn near
+    step: float = 0.7  # how far the distribution moves toward that of the best samples, as a share
+    speed_std: float = 0.3  # of the first generation [m/s]
+    offset_std: float = 0.4  # [m]; four times as much where no limit holds
+    heading_std: float = 0.5  # [rad]
+    least_std: float = 0.05  # of any generation, of all three
+    common: float = 0.5  # share of the variance that all segments of a sample have in common
+    smooth: float = 1.5  # reach of the correlation of the rest [segments]
+    margin_m: float = 0.05  # by which ways stay within the limit [m]
+    beyond_cost: float = 20.0  # of a metre beyond that, where a metre that is missing to the goal costs 1
 
     @property
     def seeds(self) -> int:
@@ -65,21 +54,13 @@ class SteerCfg:
 
 
 def seek_witnesses(
-    crosser: Crosser,
-    walkers: Mapping[str, str],
-    terrains: Terrains,
-    seeds: NDArray[np.uint32],
-    limit_m: float,
-    *,
-    rng: np.random.Generator,
-    label: str = "",
-    cfg: SteerCfg | None = None,
-) -> Witnesses:
+    crosser: Crosser, walkers: Mapping[str, str], terrains: Terrains, seeds: NDArray[np.uint32], limit_m: float, *,
+    rng: np.random.Generator, cfg: SteerCfg, label: str = "",
+) -> Witnesses:  # fmt: skip
     """Witnesses of T terrains: each of the walkers, controllers by name, tries those that have none on the line yet.
 
     A walker first looks for a way on the line, then for any. ``seeds`` have the shape (T, walkers * cfg.seeds).
     """
-    cfg = cfg or SteerCfg()
     count, generations = len(terrains), cfg.generations
     best = no_witnesses(count, limit_m)
     for index, (name, policy) in enumerate(walkers.items()):
@@ -108,20 +89,10 @@ def seek_witnesses(
 
 
 def find_ways(
-    crosser: Crosser,
-    policy: str,
-    terrains: Terrains,
-    seeds: NDArray[np.uint32],
-    *,
-    limit_m: float | None,
-    rng: np.random.Generator,
-    label: str,
-    cfg: SteerCfg,
-) -> NDArray[np.float32]:
-    """The best way on each of T terrains, shape (T, SEGMENTS, 3), with a seed a generation, (T, generations).
-
-    Where ``limit_m`` is not None, ways stay so near to the straight line [m].
-    """
+    crosser: Crosser, policy: str, terrains: Terrains, seeds: NDArray[np.uint32], *, limit_m: float | None,
+    rng: np.random.Generator, label: str, cfg: SteerCfg,
+) -> NDArray[np.float32]:  # fmt: skip
+    """The best way on each terrain, (T, SEGMENTS, 3), within ``limit_m`` of the line; seeds are (T, generations)."""
     mean, std, limits = first_ways(len(terrains), crosser.robot, policy, limit_m, cfg)
     with Bar(label, cfg.generations) as bar:
         for generation in range(cfg.generations):
@@ -169,10 +140,7 @@ def move_to_best(
     mean: NDArray[np.floating], std: NDArray[np.floating], samples: NDArray[np.floating], score: NDArray[np.floating],
     cfg: SteerCfg,
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:  # fmt: skip
-    """Mean and deviation of the next generation of T terrains, shape (T, ...): those of this one, moved to the best.
-
-    Samples have shape (T, S, ...) and scores (T, S).
-    """
+    """Mean and deviation of the next generation, (T, ...): moved to the best samples (T, S, ...) by scores (T, S)."""
     order = np.argsort(-score, axis=1, kind="stable")[:, : cfg.best]
     best = np.take_along_axis(samples, order.reshape(*order.shape, *[1] * (mean.ndim - 1)), axis=1)
     arrives = (score.max(axis=1) > 0.0).reshape(-1, *[1] * (mean.ndim - 1))  # else it is drawn as widely
@@ -181,10 +149,7 @@ def move_to_best(
 
 
 def score_ways(result: RolloutResult, longest_s: float, limit_m: float | None, cfg: SteerCfg) -> NDArray[np.float64]:
-    """How good the way of each episode is, shape (T, R): to the goal, and soon; else far ahead; within the limit.
-
-    ``longest_s`` is the time after which a crossing ends [s]. A way that leads to the goal has more than 0.
-    """
+    """How good each way is, (T, R): over 0 at the goal, best soon; else far ahead; less where beyond the limit."""
     missing = np.abs(CrossingCfg.goal[0] - result.final_position[..., 0])  # ahead: to go aside costs nothing
     soon = 10.0 - 2.0 * result.duration_s / longest_s
     score = np.where(result.reached_goal, soon, -missing - result.base_collision)
@@ -226,17 +191,15 @@ def cross_half(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
 def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     """The kind of witness that each of T ways is, as its index in :data:`WITNESSES`, shape (T,).
 
-    ``counts`` are those of ``Witnesses.counts``. A way is a witness if it leads at least half of the episodes to the
-    goal, and more than the plain command does, with both physics (Fisher's exact test; Benjamini and Hochberg 1995).
-    No more than a quarter of the episodes of either may be invalid.
+    A way is a witness if it leads at least half of the episodes to the goal, and more than the plain command does, with
+    both physics (Fisher's exact test; Benjamini and Hochberg 1995). Too many invalid episodes say nothing.
     """
     kinds = np.zeros(len(counts), np.int64)
     goals_plain, valid_plain = counts[:, :, 0, 2], counts[:, :, 0, 3]
     valid, crossed = counts[:, :, 1, 3], cross_half(counts[:, :, 1])
     known = (counts[..., 3] >= (1.0 - MAX_INVALID_SHARE) * EPISODES).all(axis=(1, 2))
     for kind, column in ((1, 2), (2, 1), (3, 0)):
-        goals = counts[:, :, 1, column]
-        p = fisher_p(goals, valid, goals_plain, valid_plain).max(axis=1)
+        p = fisher_p(counts[:, :, 1, column], valid, goals_plain, valid_plain).max(axis=1)
         crosses = known & crossed[..., column].all(axis=1)
         lucky = false_discovery_control(np.clip(p, 0.0, 1.0)) > MAX_FALSE_DISCOVERIES
         kinds[crosses & ~lucky] = kind
@@ -244,10 +207,7 @@ def find_kinds(counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def measure_line(crosser: Crosser, policy: str, terrains: Terrains, label: str = "") -> float:
-    """Largest distance from the straight line of a way on the line [m].
-
-    It is :data:`LINE_M`, or the 95th percentile of the distances of plain crossings of ``terrains`` if that is more.
-    """
+    """Largest distance from the line of a way on it [m]: :data:`LINE_M`, or the 95th percentile of plain crossings."""
     label = f"{label}how far from the straight line it goes unsteered"
     result = crosser.cross(policy, terrains, replicas=_LINE_EPISODES, invalid_ok=True, label=label)
     distances = result.deviation[result.reached_goal]

@@ -168,7 +168,7 @@ class ExportCommand(ControllerFlags, EliteFlags):
             export_pack(self.from_pack, self.elite or "0", self.robot, **options)
 
     def _make_pack(self) -> None:
-        from qd.evaluate.packing import make_pack
+        from qd.evaluate.pack import make_pack
         from qd.faults.searches import find_search
         from qd.search.archive import read_archive
         from qd.search.directory import find_run

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from qd.evaluate.measures import terrain_rates, valid_interval, valid_mean
+from qd.evaluate.tables import terrain_rates, valid_interval, valid_mean
 from qd.faults.families import find_families
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.crosser import Crosser
@@ -32,7 +32,7 @@ DISTURBED = {"routes": (f"{SUPER_GAUSSIAN.name}+command", ROUTES), "pushes": (f"
 """Space and stream of the sets that are disturbed in time, all of which are crossed in MuJoCo C."""
 
 Rates = dict[str, NDArray[np.float64]]
-"""By measure as :func:`qd.evaluate.measures.terrain_rates` has them."""
+"""By measure as :func:`qd.evaluate.tables.terrain_rates` has them."""
 
 
 def cross_in_all_ways(

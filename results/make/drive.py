@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.level import measure_level_ground
-from qd.evaluate.measures import valid_interval
+from qd.evaluate.tables import valid_interval
 from qd.faults.judge import count_outcomes, elite_seeds, judge
 from qd.faults.numbers import EPISODES
 from qd.search.archive import Archive, goal_rates

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.evaluate import cross_sets
-from qd.evaluate.measures import terrain_rates, valid_mean
 from qd.evaluate.sets import TerrainSet, generated_set, paper_terrains, plain_set
+from qd.evaluate.tables import terrain_rates, valid_mean
 from qd.faults.numbers import EPISODES
 from qd.search.archive import read_archive
 from qd.search.fitness import FAILING_GOAL_RATE

@@ -8,7 +8,7 @@ left out, since no archive of its rounds is published to compare with. A publish
 from collections.abc import Sequence
 from typing import Any
 
-from qd.evaluate.packing import make_pack
+from qd.evaluate.pack import make_pack
 from qd.faults.judge import judge
 from qd.faults.searches import find_search
 from qd.search.loop import search

@@ -16,6 +16,7 @@ from typing import Any
 from qd.check import ensure_ready, ensure_stray
 from qd.evaluate.dose import measure_dose, parse_doses
 from qd.evaluate.evaluate import evaluate_rates
+from qd.evaluate.labels import SetsCfg
 from qd.evaluate.level import measure_level_ground
 from qd.faults.families import Ranking
 from qd.faults.judge import judge
@@ -55,7 +56,7 @@ HEIGHTS = (0.05, 0.1, 0.2)
 _RISES = "0.02,0.04,0.06,0.08,0.1,0.15,0.2,0.3"
 OBSTACLES = (f"step_up={_RISES}", f"stairs_up={_RISES}", "payload", "delay")
 """Of which the size is measured that half of the robots cross."""
-RATES = {"terrains": 100, "episodes": 10}
+RATES = SetsCfg(terrains=100, episodes=10)
 """Of a set, and of a terrain."""
 
 
@@ -128,10 +129,10 @@ def measure(name: str, folder: Path, runs: Path, compute: Compute, *, seed: int,
     with Crosser(robot, compute, cache=runs / "crossings") as crosser:
         walks = measure_level_ground(crosser, policy, mujoco_c=True)
     by_publisher = walk(publisher, episodes=2 if small else 20, speed=robot.speed, duration_s=robot.max_duration_s)
-    rates, sizes = dict[str, Any](), {"terrains": 4, "episodes": 1} if small else RATES
+    rates, sizes = dict[str, Any](), SetsCfg(terrains=4, episodes=1) if small else RATES
     for height in HEIGHTS[: 1 if small else None]:
         out, at = runs / f"{name}-rates-{height:g}.json", at_height(SUPER_GAUSSIAN, height).name
-        report = evaluate_rates(robot, policy, compute=compute, space=at, seed=seed, out=out, **sizes)
+        report = evaluate_rates(robot, policy, replace(sizes, space=at, seed=seed), compute=compute, out=out)
         common = runs / f"{name}-archive-{height:g}"
         searched = search_at(robot, at, common, compute, seed=seed, small=small, emitters=COMMON_EMITTERS)
         rates[f"{height:g}"] = {key: report[key] for key in ("hand_crafted", "hard_random")} | {"search": searched[1]}

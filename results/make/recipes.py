@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from qd.evaluate.evaluate import cross_sets
-from qd.evaluate.measures import terrain_rates
 from qd.evaluate.sets import generated_set, paper_terrains, plain_set
+from qd.evaluate.tables import terrain_rates
 from results.make.common import SEEDS, Script, file_name, parse
 from results.make.tables import MIXES, SIZES, train, train_controllers
 from train.cfg import FinetuneCfg, PpoCfg, TaskCfg

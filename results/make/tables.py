@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from qd.evaluate.evaluate import cross_sets, crossings_folder, evaluate_tables
 from qd.evaluate.labels import SetsCfg
-from qd.evaluate.measures import kind_mean, terrain_rates
 from qd.evaluate.sets import elites_sha256, make_sets, paper_terrains
-from qd.evaluate.tables import by_kind
+from qd.evaluate.tables import by_kind, kind_mean, terrain_rates
 from qd.search.archive import read_archive
 from results.make.common import SEEDS, Script, parse, publish_controller, published_controllers, read_made
 from sim.controllers.spec import controller_hash

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from kernels.episode import PARKING_HEIGHT, Outcome
-from qd.evaluate.measures import terrain_rates
+from qd.evaluate.tables import terrain_rates
 from qd.search import loop
 from qd.workers import crosser
 from results.make import agreement, bare, common, docs, speed, tables

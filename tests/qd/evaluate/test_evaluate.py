@@ -13,7 +13,6 @@ import pytest
 from qd.commands import EvaluateCommand
 from qd.evaluate import evaluate as evaluation
 from qd.evaluate import pack as packs
-from qd.evaluate import packing
 from qd.evaluate.evaluate import evaluate_rates, evaluate_tables
 from qd.evaluate.labels import SETS, SetsCfg
 from qd.evaluate.sets import split_elites
@@ -99,8 +98,8 @@ def test_controllers_are_not_tested_on_what_they_were_trained_on(anymal, archive
 def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     robots = Robots(arrives)
-    given = {"compute": compute_by(robots), "terrains": 3, "episodes": 1}
-    report = evaluate_rates(anymal, STAND, **given)
+    cfg, compute = SetsCfg(terrains=3, episodes=1), compute_by(robots)
+    report = evaluate_rates(anymal, STAND, cfg, compute=compute)
     # Under runs/, never under results/, where the published ones stand; another controller has a file of its own.
     written = json.loads(Path("runs/anymal-tests.sim.policies-stand-rates.json").read_text())
     assert written == json.loads(json.dumps(report))
@@ -109,7 +108,7 @@ def test_rates_of_one_controller(anymal, tmp_path, monkeypatch):
     # Velocity errors count from 2 s on: 1 (m/s)^2 s in 13 of 15 s.
     assert {cfg.penalties_from_s for cfg in robots.opened} == {2.0}
     assert report["flat"]["vx_error_mean"] == pytest.approx((1 / 13) ** 0.5)
-    evaluate_rates(anymal, str(anymal.policy_file), **given)
+    evaluate_rates(anymal, str(anymal.policy_file), cfg, compute=compute)
     assert Path("runs/anymal-rates.json").exists()
 
 
@@ -169,7 +168,7 @@ def candidate(elite, *, fault=True, family=0, cause="ridge", kind="elite", rate=
 )
 def test_what_comes_next(candidates, expected):
     for size in (9, 1):  # each beginning of a pack is one
-        assert packing.choose_terrains(candidates, size) == expected[:size]
+        assert packs.choose_terrains(candidates, size) == expected[:size]
 
 
 def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypatch):
@@ -179,7 +178,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     def make(controllers, *others, **changes):
         searches = [*map(find_search, (path, *others))]
         how = {"compute": compute_by(robots), "out": Path("pack"), "overwrite": True}
-        return packing.make_pack(searches, controllers, **how, **changes)
+        return packs.make_pack(searches, controllers, **how, **changes)
 
     compute = compute_by(Robots(bump_stops))
     judge(path, stages=("resolved",), compute=compute)
@@ -219,7 +218,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     assert not {entry["mark"] for entry in new} & {entry["mark"] for entry in content["terrains"]}
     for clash, named in (([path], "twice"), ([], "version 4")):
         with pytest.raises(ValueError, match=named):
-            packing.make_pack(
+            packs.make_pack(
                 [*map(find_search, (path, *clash))],
                 base,
                 compute=compute_by(robots),
@@ -241,7 +240,7 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
 def test_what_a_steered_robot_crosses_on_the_line_is_a_candidate(anymal, tmp_path):
     search = SimpleNamespace(space=SUPER_GAUSSIAN, run=tmp_path, robot=anymal)
     for archive, passable in ((judged_archive(), [0, 2, 4]), (steered_archive(), [0, 1, 2, 4])):
-        candidates, not_passable = packing.find_candidates([search], [archive])
+        candidates, not_passable = packs.find_candidates([search], [archive])
         assert [candidate.entry["elite"] for candidate in candidates] == passable
         assert not_passable == 5 - len(passable)
         steered = {candidate.entry["elite"] for candidate in candidates if "witness" in candidate.entry}
@@ -311,9 +310,8 @@ def test_rates_over_a_pack_are_means_with_families_drawn_together():
 
 def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     robots = Robots(fails)
-    sizes = {"compute": compute_by(robots), "episodes": 2}
-    stored = packs.read_pack(Path("pack"))
-    report = packs.evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=2, **sizes)
+    given = packs.read_pack(Path("pack")), anymal, "tests.sim.policies:stand"
+    report = packs.evaluate_pack(*given, SetsCfg(terrains=2, episodes=2), compute=compute_by(robots))
     (file,) = Path("runs").glob("anymal-*-pack.json")
     assert json.loads(file.read_text()) == json.loads(json.dumps(report))
     # It fails the first terrain, which is 4 m high, and crosses the flat one.
@@ -324,7 +322,7 @@ def test_any_controller_is_tested_on_a_pack(pack, anymal, capsys):
     shown = capsys.readouterr().out
     assert "1 of 2" in shown and "ridge" in shown
     assert not robots.opened[0].reward and robots.opened[0].engine == "search"
-    whole = packs.evaluate_pack(stored, anymal, "tests.sim.policies:stand", terrains=9, **sizes)
+    whole = packs.evaluate_pack(*given, SetsCfg(terrains=9, episodes=2), compute=compute_by(robots))
     assert whole["rates"]["terrains"] == 3
 
 

@@ -121,7 +121,7 @@ def pass_gate(anymal, text, collide, *, policies=None, junit=None):
     Path("gate.toml").write_text(text)
     robots = Robots(collide)
     policies = policies or {"new": STAND}
-    return publish_gate(Path("gate.toml"), anymal, policies, compute_by(robots), out=Path("out/g.json"), junit=junit)
+    return publish_gate(Path("gate.toml"), anymal, policies, compute_by(robots), Path("out/g.json"), junit)
 
 
 def share_arrives(share, old=0.9):

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from qd.evaluate.labels import FATES, SETS
-from qd.evaluate.measures import kind_mean, measure, summarise_crossings, valid_interval, valid_mean, velocity_error
 from qd.evaluate.sets import (
     TRAINED_ON,
     generated_set,
@@ -22,7 +21,21 @@ from qd.evaluate.sets import (
     set_rng,
     split_elites,
 )
-from qd.evaluate.tables import as_tables, check_seeds, difference, make_tables, over_seeds, read_tables, show_tables
+from qd.evaluate.tables import (
+    as_tables,
+    check_seeds,
+    difference,
+    kind_mean,
+    make_tables,
+    measure,
+    over_seeds,
+    read_tables,
+    show_tables,
+    summarise_crossings,
+    valid_interval,
+    valid_mean,
+    velocity_error,
+)
 from qd.search.settings import as_settings
 from results.make.common import t_interval
 from sim.robots.robot import robot_identity

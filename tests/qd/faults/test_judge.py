@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from qd.faults.judge import InMujocoC, count_outcomes, draw_faults, elite_seeds, fresh_values, is_decided, judge
+from qd.faults.judge import STAGES, count_outcomes, draw_faults, elite_seeds, fresh_values, is_decided, judge
 from qd.search.archive import no_witnesses, read_archive, write_archive
 from qd.search.fitness import FitnessCfg
 from qd.search.progress import Bar
@@ -264,7 +264,7 @@ def test_mujoco_c_crosses_faults_alone_and_no_soft_ground(path):
         judged(path, Robots(cross_by_genes, stop_after=0), stages=("mujoco_c",))
     soft = SimpleNamespace(search=SimpleNamespace(space=get_space("super_gaussian+softness")))
     with pytest.raises(ValueError, match="softness"):
-        InMujocoC().check(read_archive(path), soft, ())
+        STAGES["mujoco_c"].check(read_archive(path), soft, ())
 
 
 def witnessed(path, monkeypatch, kinds=(3,), speed=0.0, **changes):
