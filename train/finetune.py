@@ -18,18 +18,9 @@ from sim.files.command import command_line
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import load_space, space_at, space_key
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
+from train.ppo import training
 from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
 from train.ppo.learner import Ranks
-from train.ppo.training import (
-    DESCRIBED,
-    Training,
-    check_resumed,
-    dump_settings,
-    find_device,
-    is_finished,
-    read_saved,
-    run_directory,
-)
 from train.task.tiles import Mix, TrainingElites
 
 _CRITIC_ITERATIONS = 50
@@ -41,12 +32,12 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     If the directory holds a checkpoint of the same settings, the training goes on; a finished one is left as it is.
     ``run_dir`` gets checkpoint, controller, record and TensorBoard's file. ``run`` has the device and an export.
     """
-    device = find_device(run.device)
+    device = training.find_device(run.device)
     if Ranks.from_environment().size > 1:
         raise ValueError("a fine-tuning must be one process, got several by torchrun: begin it without")
     cfg = cfg.sized(robot, device)
     checkpoint = run_dir / CHECKPOINT
-    saved = read_saved(run_dir, "finetune", robot.name) if checkpoint.exists() else None
+    saved = training.read_saved(run_dir, "finetune", robot.name) if checkpoint.exists() else None
     # The first controller of a training that goes on may be gone.
     start = read_start(Path(cfg.policy or robot.policy_file) if saved is None else checkpoint, robot)
     if saved is None and cfg.recipe.noise_of is not None:
@@ -55,20 +46,20 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims))
     elites = find_training_elites(robot, cfg)
     settings = {
-        **dump_settings(cfg, robot),
+        **training.dump_settings(cfg, robot),
         "elites": elites.archives,
         "spaces": list(dict.fromkeys(space_key(space.name, space.sha256) for space in elites.spaces)),
     }
     if saved is not None:
-        check_resumed(run_dir, saved, settings)
-        if is_finished(run_dir, cfg.iterations, run.export):
+        training.check_resumed(run_dir, saved, settings)
+        if training.is_finished(run_dir, cfg.iterations, run.export):
             print(f"{run_dir} is finished: all {cfg.iterations} iterations are done; with more it goes on.")
-            return _write_onnx(run_dir / (POLICY if start.controller is None else DESCRIBED), robot)
+            return _write_onnx(run_dir / (POLICY if start.controller is None else training.DESCRIBED), robot)
     if start.controller is not None and saved is None and run.export is not None:
         description = run.export.with_suffix(".toml")
         if description.exists():
             raise ValueError(f"export also writes {description}, which exists: name another file")
-    with run_directory(run_dir, run.export):
+    with training.run_directory(run_dir, run.export):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
@@ -78,7 +69,7 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
             facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
         mix = Mix(cfg=cfg, elites=elites, device=device)
         how = {"settings": settings, "saved": saved, "mix": mix, "facts": facts, "start": start}
-        policy = Training(robot, cfg, run_dir, device=device, **how).run(run.export)
+        policy = training.Training(robot, cfg, run_dir, device=device, **how).run(run.export)
     return _write_onnx(policy, robot)
 
 
@@ -101,7 +92,9 @@ def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunC
     if controller_hash(policy or robot.policy_file) != archive.policy_sha256:
         rule = f"policy must be the controller that {run} searched"
         raise ValueError(f"{rule}, got {policy or SHIPPED}, whose file differs: name it by --policy")
-    cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, find_device(options.device), **SPECIALIST)
+    cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(
+        robot, training.find_device(options.device), **SPECIALIST
+    )
     specialist = run / CERTIFIERS_FOLDER / f"{CERTIFIER}.pt"
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 from rsl_rl.env import VecEnv
-from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 from torch import distributed
 
@@ -76,21 +75,19 @@ class Ranks:
 class CommandVecEnv(VecEnv):
     """rsl_rl's view of a :class:`CommandTask`: one observation group, ``policy``, for actor and critic.
 
-    A described actor has another group, ``actor``, and acts through its description.
-
-    Every returned tensor is a copy: rsl_rl keeps the observation it acted on, and the task overwrites its memory in the
-    next step.
+    A described actor has another group, ``actor``, and acts through its description ``controller``. Every returned
+    tensor is a copy, because the next step overwrites the task's memory.
     """
 
     def __init__(self, task: CommandTask, controller: ControllerCfg | None = None) -> None:
-        """Wrap a task; ``controller`` describes an actor with other observations and actions than the task's."""
         self.task = task
         self.controller = controller
-        self._described = None if controller is None else Described(controller, task.robot, "the controller")
-        self.num_envs = task.num_envs
-        self.num_actions = task.robot.num_joints if self._described is None else self._described.num_actions
-        if self._described is not None:
+        self.num_envs, self.num_actions = task.num_envs, task.robot.num_joints
+        self._described = None
+        if controller is not None:
+            self._described = Described(controller, task.robot, "the controller")
             self._described.use(None, task.observation.device)
+            self.num_actions = self._described.num_actions
         self.max_episode_length = task.max_episode_steps
         self.device = str(task.observation.device)
         self.cfg = asdict(task.cfg)
@@ -105,10 +102,7 @@ class CommandVecEnv(VecEnv):
         self.task.episode_steps.copy_(steps)
 
     def get_observations(self) -> TensorDict:
-        """The present observations, ``policy``: shape (num_envs, observation_size).
-
-        Call it when all episodes begin; :meth:`step` returns those after each step.
-        """
+        """The present observations, ``policy`` of shape (num_envs, observation_size), when all episodes begin."""
         groups = {"policy": self.task.observation.clone()}
         if self._described is not None:
             self._described.reset(self.task.episode_steps == 0)
@@ -126,20 +120,6 @@ class CommandVecEnv(VecEnv):
         # A robot at its goal or out of the world did not fail, so its value goes on as after a time-out.
         cut = (end == int(Outcome.TIME_OUT)) | (end == int(Outcome.GOAL)) | (end == int(Outcome.OUT))
         return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": cut}
-
-
-class Runner(OnPolicyRunner):
-    """rsl_rl's runner, also for several processes on CPUs."""
-
-    def _configure_multi_gpu(self) -> None:
-        ranks = Ranks.from_environment()
-        if ranks.size == 1 or self.device.startswith("cuda"):
-            super()._configure_multi_gpu()
-            return
-        self.is_distributed, self.gpu_world_size = True, ranks.size
-        self.gpu_local_rank, self.gpu_global_rank = ranks.local_rank, ranks.rank
-        self.cfg["multi_gpu"] = {"global_rank": ranks.rank, "local_rank": ranks.local_rank, "world_size": ranks.size}
-        distributed.init_process_group("gloo")  # rsl_rl chooses NCCL, which CPUs lack
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,9 +158,16 @@ class Learner:
         self._mean: State = {}
         self.ranks = Ranks.from_environment()
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
+        settings, device = runner_settings(cfg, env.controller), str(env.device)
+        if self.ranks.size > 1:
+            on_cuda = device.startswith("cuda")
+            distributed.init_process_group("nccl" if on_cuda else "gloo")
+            if on_cuda:
+                torch.cuda.set_device(self.ranks.local_rank)
+            settings["multi_gpu"] = {"global_rank": self.ranks.rank, "world_size": self.ranks.size}
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
-            self.runner = Runner(env, runner_settings(cfg, env.controller), log_dir=None, device=str(env.device))
-        self.alg: CapturedPPO = self.runner.alg  # pyright: ignore[reportAttributeAccessIssue] - as its settings say
+            alg: Any = CapturedPPO.construct_algorithm(env.get_observations(), env, settings, device)
+        self.alg: CapturedPPO = alg
         if self.ranks.size > 1:
             self.alg.broadcast_parameters()
             self._draw_apart(seed)
@@ -191,7 +178,7 @@ class Learner:
         torch.manual_seed((seed + 1) * 1_000_003 + self.iteration * 1009 + self.ranks.rank)
 
     def begin(self) -> None:
-        """Start from an environment whose episodes have all just begun."""
+        """Starts from an environment whose episodes have all just begun."""
         if self._random_ages:
             ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
             self.env.episode_length_buf = ages
