@@ -29,8 +29,8 @@ _CRITIC_ITERATIONS = 50
 def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN) -> Path:
     """Trains a controller further by PPO, on hand-crafted terrains and on those of archives; returns its file.
 
-    If the directory holds a checkpoint of the same settings, the training goes on; a finished one is left as it is.
-    ``run_dir`` gets checkpoint, controller, record and TensorBoard's file. ``run`` has the device and an export.
+    It goes on where the directory holds a checkpoint of the same settings; a finished training is left as it is.
+    ``run_dir`` gets checkpoint, controller, record and TensorBoard's file.
     """
     device = training.find_device(run.device)
     if Ranks.from_environment().size > 1:
@@ -55,18 +55,14 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
         if training.is_finished(run_dir, cfg.iterations, run.export):
             print(f"{run_dir} is finished: all {cfg.iterations} iterations are done; with more it goes on.")
             return _write_onnx(run_dir / (POLICY if start.controller is None else training.DESCRIBED), robot)
-    if start.controller is not None and saved is None and run.export is not None:
-        description = run.export.with_suffix(".toml")
-        if description.exists():
-            raise ValueError(f"export also writes {description}, which exists: name another file")
+    if start.controller and saved is None and run.export and (file := run.export.with_suffix(".toml")).exists():
+        raise ValueError(f"export also writes {file}, which exists: name another file")
     with training.run_directory(run_dir, run.export):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
-        if saved is None:
-            facts = first_facts(robot, cfg, elites, start)
-        else:
-            facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
+        facts = saved or first_facts(robot, cfg, elites, start)
+        facts = {name: facts[name] for name in (TRAINED_ON, "critic_iterations")}
         mix = Mix(cfg=cfg, elites=elites, device=device)
         how = {"settings": settings, "saved": saved, "mix": mix, "facts": facts, "start": start}
         policy = training.Training(robot, cfg, run_dir, device=device, **how).run(run.export)
@@ -81,10 +77,9 @@ def _write_onnx(policy: Path, robot: RobotCfg) -> Path:
 
 
 def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
-    """Trains a search's specialist, by :meth:`FinetuneCfg.specialist`, and writes it to the certifiers of the run.
+    """Trains the searched controller further, on all elites that it fails in fresh episodes, as a certifier of the run.
 
-    It is the controller of the search, trained further on all elites that it fails in fresh episodes, in
-    ``<run>/specialist``. A certificate is a proof of existence, so a certifier may have trained on its terrain.
+    A certificate is a proof of existence, so a certifier may have trained on its terrain.
     """
     archive = read_robot_archive(robot, run, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]
@@ -110,9 +105,7 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):
         held_out.update(hash_elites(archive.genes[np.concatenate([split.test, split.validation])]))
-    genes = []
-    goal_rates = []
-    records = []
+    genes, goal_rates, records = [], [], []
     for archive, split, path in zip(archives, splits, paths, strict=True):
         rows = split.train
         if cfg.recipe.only == "failing":
@@ -128,19 +121,15 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
         sizes = {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation)}
         records.append({**sizes, "sha256": elites_sha256(archive)})
     if not any(map(len, genes)):
-        names = ", ".join(map(str, paths))
-        raise ValueError(f"{names} must have elites to train on that are {cfg.recipe.only}, got none")
+        raise ValueError(f"{', '.join(map(str, paths))} must have elites that are {cfg.recipe.only}, got none")
     spaces = tuple(archive.terrain_space for archive in archives)
     return TrainingElites(genes=tuple(genes), spaces=spaces, goal_rate=np.concatenate(goal_rates), archives=records)
 
 
 def first_facts(robot: RobotCfg, cfg: FinetuneCfg, elites: TrainingElites, start: Start) -> dict[str, Any]:
     """What checkpoint and record of a new fine-tuning say beside its settings."""
-    critic_iterations = cfg.recipe.critic_iterations
-    if critic_iterations is None:
-        critic_iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
+    alone = cfg.recipe.critic_iterations
+    alone = min(_CRITIC_ITERATIONS, cfg.iterations // 2) if alone is None else alone
     trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
-    return {
-        TRAINED_ON: sorted({*chain(*map(hash_elites, elites.genes)), *trained_before}),
-        "critic_iterations": critic_iterations if start.critic is None else 0,
-    }
+    trained_on = sorted({*chain(*map(hash_elites, elites.genes)), *trained_before})
+    return {TRAINED_ON: trained_on, "critic_iterations": 0 if start.critic else alone}

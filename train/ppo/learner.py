@@ -9,7 +9,7 @@ import math
 import os
 import time
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.env import VecEnv
@@ -110,10 +110,10 @@ class CommandVecEnv(VecEnv):
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Make one control step with ``actions`` (num_envs, num_actions), without host synchronisation.
+        """Makes one control step with ``actions`` (num_envs, num_actions), without host synchronisation.
 
-        Returns observations after it (of the new episode if one ended), rewards (num_envs,), dones (num_envs,) and
-        ``{"time_outs": (num_envs,)}``, the dones that no failure caused.
+        Returns observations, of the new episode if one ended, rewards and dones, and ``{"time_outs": ...}``, the dones
+        that no failure caused; all of shape (num_envs,).
         """
         self.task.step(actions if self._described is None else self._described.act(actions))
         end = self.task.end
@@ -122,14 +122,12 @@ class CommandVecEnv(VecEnv):
         return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": cut}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Iteration:
-    """Durations and losses of one iteration."""
+class Iteration(NamedTuple):
+    """Durations of one iteration, and its mean value, surrogate and entropy losses."""
 
     collection_s: float
     learning_s: float
     losses: dict[str, float]
-    """Mean value, surrogate and entropy losses."""
 
 
 class Learner:
@@ -143,18 +141,14 @@ class Learner:
     """
 
     def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int, random_ages: bool = True) -> None:
-        """Draw the networks from ``seed``, and later the actions.
+        """Draws the networks from ``seed``, and later the actions.
 
-        With ``random_ages`` the first episodes begin at random ages, so that they do not end together; they are shorter
-        than others.
+        With ``random_ages`` the first episodes begin at random ages, so that they do not end together.
         """
         torch.manual_seed(seed)
         torch.set_float32_matmul_precision("high")  # TF32 on CUDA: half the learning time, no measurable loss
-        self.env = env
-        self.cfg = cfg
-        self._random_ages = random_ages
-        self.iteration = 0
-        self.averaged = 0
+        self.env, self.cfg, self._random_ages = env, cfg, random_ages
+        self.iteration = self.averaged = 0
         self._mean: State = {}
         self.ranks = Ranks.from_environment()
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
@@ -185,7 +179,7 @@ class Learner:
         self._observations = self.env.get_observations()
 
     def iterate(self) -> Iteration:
-        """Collect ``steps_per_env`` control steps of every environment, then update the networks.
+        """Collects ``steps_per_env`` control steps of every environment, then updates the networks.
 
         After a FloatingPointError the networks are unusable; the last checkpoint is intact.
         """
@@ -208,7 +202,7 @@ class Learner:
             got = f"losses {losses} or weights that are not: begin again with a lower --ppo.learning-rate"
             raise FloatingPointError(f"iteration {self.iteration}: losses and weights must be finite, got {got}")
         self.iteration += 1
-        return Iteration(collection_s=collected - began, learning_s=time.perf_counter() - collected, losses=losses)
+        return Iteration(collected - began, time.perf_counter() - collected, losses)
 
     def actor_state(self) -> State:
         """The actor under rsl_rl's keys, on the CPU."""

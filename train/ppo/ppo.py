@@ -66,17 +66,14 @@ class CapturedPPO(PPO):
         self._eager_steps = 0
 
     def let_actor_learn(self, learns: bool) -> None:
-        """Let updates change the actor, or the critic alone at a constant learning rate.
-
-        An untrained critic would mislead a trained actor.
-        """
+        """Lets updates change the actor, or, while an untrained critic would mislead it, the critic alone."""
         self._actor_learns.fill_(float(learns))
 
     def begin_actor(self) -> None:
-        """Reset the optimiser's moments of the actor, and let it learn in small steps at first.
+        """Resets the optimiser's moments of the actor, and lets it learn in small steps at first.
 
-        While the critic learned alone, the actor's gradients were zero. Adam's second moment has counted these zeros,
-        so that its first steps would be three times too large.
+        Adam's second moment has counted the zero gradients while the critic learned alone, so that the first steps
+        would be three times too large.
         """
         for parameter in self.actor.parameters():
             for value in self.optimizer.state.get(parameter, {}).values():

@@ -72,9 +72,8 @@ def stop_request() -> Iterator[threading.Event]:
 def train(robot: RobotCfg, cfg: TrainCfg, run_dir: Path, run: RunCfg = RUN) -> Path:
     """Trains a controller by PPO on legged_gym's rough-terrain task; returns its file, ``<run_dir>/policy.pt``.
 
-    If the directory holds a checkpoint of the same settings, the training goes on. torchrun may start several processes
-    of it, each with its GPU and ``cfg.num_envs`` robots. ``run_dir`` gets checkpoint, controller, record and
-    TensorBoard's file. ``run`` has the device and an export.
+    It goes on where the directory holds a checkpoint of the same settings. torchrun may start several processes of it,
+    each with its GPU and ``cfg.num_envs`` robots. ``run_dir`` gets checkpoint, controller, record and TensorBoard file.
     """
     device = find_device(run.device)
     cfg = cfg.sized(robot, device)
@@ -134,13 +133,12 @@ def read_saved(run_dir: Path, kind: Literal["train", "finetune"], robot: str) ->
 
 def check_resumed(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
     """Refuses to go on with other settings than a training was begun with, or with fewer iterations than are done."""
-    before = {name: value for name, value in saved["settings"].items() if name not in _FREE}
-    now = {name: value for name, value in settings.items() if name not in _FREE}
+    both = (saved["settings"], settings)
+    before, now = ({name: value for name, value in each.items() if name not in _FREE} for each in both)
     if different := differences(before, now):
         raise ValueError(f"{run_dir} was begun with other settings: {', '.join(different)}: give those")
-    if saved["iter"] > settings["iterations"]:
-        rule = f"iterations must be at least {saved['iter']}, which {run_dir} has done"
-        raise ValueError(f"{rule}, got {settings['iterations']}")
+    if (done := saved["iter"]) > (wanted := settings["iterations"]):
+        raise ValueError(f"iterations must be at least {done}, which {run_dir} has done, got {wanted}")
 
 
 def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
@@ -177,15 +175,12 @@ class Training:
         facts: dict[str, Any] | None = None,
         start: Start | None = None,
     ) -> None:
-        """Begin, with the networks of ``start`` if given, or go on from a checkpoint (:func:`read_saved`).
+        """Begins, with the networks of ``start`` if given, or goes on from a checkpoint (:func:`read_saved`).
 
         Without ``mix`` robots walk on the tiles of the curriculum. Checkpoint and record have ``settings``
         (:func:`dump_settings`) under one key and each of ``facts`` under its own.
         """
-        self._cfg = cfg
-        self._run_dir = run_dir
-        self._settings = settings
-        self._mix = mix
+        self._cfg, self._run_dir, self._settings, self._mix = cfg, run_dir, settings, mix
         self._facts = facts or {}
         self.critic_iterations: int = self._facts.get("critic_iterations", 0)
         self.averaged_from = max(round((1.0 - cfg.ppo.average) * cfg.iterations), self.critic_iterations)
@@ -236,10 +231,7 @@ class Training:
         }
 
     def run(self, export: Path | None) -> Path:
-        """Iterates until all is done or a stop is requested, and saves; returns the controller's file.
-
-        ``export`` is a further file for the controller.
-        """
+        """Iterates until all is done or a stop is requested, and saves, also to ``export``; returns the controller."""
         learner = self.learner
         ranks = learner.ranks
         if ranks.is_first:
@@ -357,8 +349,8 @@ class Training:
 def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> None:
     """Writes the actor, or the mean of the last ones, and the training record ``<stem>.train.json`` beside it.
 
-    Layers are in half precision, which takes half of the space; its error is small beside the differences between
-    trainings. Readers compute in single precision, so that a controller behaves the same wherever it is measured.
+    Layers are in half precision, whose error is small beside the differences between trainings. Readers compute in
+    single precision, so that a controller behaves the same wherever it is measured.
     """
     buffer = io.BytesIO()
     trained_on = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # for a copy without its record
