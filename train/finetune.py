@@ -121,7 +121,8 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
         sizes = {"elites": len(archive), "trained_on": len(rows), "validation": len(split.validation)}
         records.append({**sizes, "sha256": elites_sha256(archive)})
     if not any(map(len, genes)):
-        raise ValueError(f"{', '.join(map(str, paths))} must have elites that are {cfg.recipe.only}, got none")
+        names = ", ".join(map(str, paths))
+        raise ValueError(f"{names} must have elites to train on that are {cfg.recipe.only}, got none")
     spaces = tuple(archive.terrain_space for archive in archives)
     return TrainingElites(genes=tuple(genes), spaces=spaces, goal_rate=np.concatenate(goal_rates), archives=records)
 

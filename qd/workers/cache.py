@@ -1,8 +1,4 @@
-"""Crossings and recordings on disk: arrays by key, in a folder of bounded size.
-
-A terrain's episodes depend on the terrain, its seed and the settings of the crossing alone. So each lot is stored when
-it is done, with a key for every terrain, and a terrain is read again in whatever lots.
-"""
+"""Crossings and recordings on disk: arrays by key, in a folder of bounded size."""
 
 import hashlib
 import os
@@ -26,9 +22,9 @@ _ROWS = "rows"
 
 
 class Cache:
-    """Arrays in the files of a folder, by key. A damaged file counts as absent, in a printed line.
+    """Arrays in the files of a folder, by key; above ``max_bytes`` the least recently used ones are removed.
 
-    The time of a file says when it was used last: above ``max_bytes`` the least recently used ones are removed.
+    A damaged file counts as absent, in a printed line.
     """
 
     def __init__(self, folder: Path, *, max_bytes: int = MAX_BYTES) -> None:
@@ -88,12 +84,13 @@ class Cache:
 
 
 class StoredCrossings:
-    """Crossings in a cache by the digest of terrain and seed; ``settings`` is the hash of all else they depend on."""
+    """Lots in a cache, of which each terrain is found by its digest and seed, in whatever lots it comes again.
+
+    ``settings`` is the hash of all else that its episodes depend on.
+    """
 
     def __init__(self, cache: Cache, settings: str, penalty_names: tuple[str, ...]) -> None:
-        self._cache = cache
-        self._settings = settings
-        self._penalty_names = penalty_names
+        self._cache, self._settings, self._penalty_names = cache, settings, penalty_names
         self._index: dict[bytes, tuple[str, int]] = {}  # of a terrain, the file's key and the row there
         for key in cache.keys(settings):  # not those that other processes write later
             if stored := cache.read(key, [_ROWS]):
