@@ -198,8 +198,7 @@ def find_worth(fitness: Any, share: Any) -> Any:
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Where the typical episode of each terrain ended: the median, by coordinate, over episodes of its typical outcome.
 
-    That is the goal where at least half reach it, else the commonest other outcome. ``counted`` says which episodes
-    count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
+    ``counted`` says which episodes count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
     """
     outcome = np.where(counted, result.outcome, Outcome.INVALID)
     alike = counted & (outcome == typical_outcome(outcome)[:, None])

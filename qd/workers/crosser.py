@@ -97,8 +97,9 @@ class Crosser(ExitStack):
         to come that agrees with this one. Many invalid episodes are reported; a result without a valid one is returned
         if ``invalid_ok``. Steps and time are those of terrains that were not in the cache.
         """
-        if replicas < 1 or engine not in (engines := get_args(Engine)):
-            raise ValueError(f"replicas must be 1 or more, engine one of {engines}, got {replicas} and '{engine}'")
+        if replicas < 1 or engine not in get_args(Engine):
+            rule = f"replicas must be 1 or more, engine one of {get_args(Engine)}"
+            raise ValueError(f"{rule}, got {replicas} and '{engine}'")
         cfg = PipelineCfg(
             compute=self.compute, robot=self.robot, policy=policy, num_terrains=max(1, len(terrains)),
             replicas=replicas, engine=engine, space=terrains.space.name, reward=reward, record=record,
