@@ -74,13 +74,9 @@ class Witnesses(ColumnTable):
 
 def no_witnesses(count: int, limit_m: float) -> Witnesses:
     """Witnesses of elites that nobody has tried."""
-    return Witnesses(
-        walker=np.full(count, "", "<U255"),
-        kind=np.zeros(count, np.int64),
-        way=np.zeros((count, SEGMENTS, len(STEERING)), np.float32),
-        counts=np.zeros((count, 2, 2, 4), np.int64),
-        limit_m=limit_m,
-    )
+    way = np.zeros((count, SEGMENTS, len(STEERING)), np.float32)
+    kind, counts = np.zeros(count, np.int64), np.zeros((count, 2, 2, 4), np.int64)
+    return Witnesses(walker=np.full(count, "", "<U255"), kind=kind, way=way, counts=counts, limit_m=limit_m)
 
 
 OUTCOMES = ("goal", "base_collision", "other", "invalid")

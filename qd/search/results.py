@@ -107,8 +107,7 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None
     numbers = {
         **origin,
         **archive.named(),
-        "space": archive.space,
-        "space_sha256": archive.space_sha256,
+        **{name: getattr(archive, name) for name in ("space", "space_sha256")},
         **found_numbers(archive, metrics),
         **dict.fromkeys(_FRESH_NUMBERS),
         **fault_numbers(archive),
@@ -148,17 +147,13 @@ def print_summary(
     flags = {"run": run, "robot": robot, "space": space}
     judge = {**flags, "policy": policy, "skip_level_ground": skip_level_ground}
     text = _TEMPLATES.get_template("summary.txt").render(
-        archive=archive,
-        ranking=ranking,
-        summary=summarise_search(ranking, archive),
-        number=number,
+        archive=archive, ranking=ranking, summary=summarise_search(ranking, archive), number=number,
         name=ranking.name(ranking.find_row(number)),
         view=command_line("view", **flags, policies=[f"searched={policy}"] if policy else []),
         report=command_line("report", **flags, policy=policy),
         replay=command_line("replay", **flags, elite=number, policy=policy),
-        judge=command_line("judge", **judge),
-        steered=command_line("judge", **judge, stages="steered"),
+        judge=command_line("judge", **judge), steered=command_line("judge", **judge, stages="steered"),
         finetune=command_line("finetune", robot=robot, specialist=run, policy=policy, space=space),
-    )
+    )  # fmt: skip
     console = Console(highlight=False)
     console.print(text.rstrip(), soft_wrap=not console.is_terminal)

@@ -66,18 +66,13 @@ def preset(
 ) -> SearchCfg:
     """Settings of a search by the name of a preset; ``policy`` and ``likely`` are shipped ones if None."""
     known = choose_likely(get_space(space, space_sha256), likely)
+    scales, named = read_penalty_scales(robot, policy), policy or SHIPPED
     return SearchCfg(
-        robot=robot.name,
-        **robot_identity(robot),
-        preset=name,
-        policy=policy or SHIPPED,
-        policy_sha256=controller_hash(resolve_policy(policy or SHIPPED, robot)),
-        space=space,
-        space_sha256=space_sha256,
-        collision_bit=robot.collision_bit,
-        fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy), disturbances=known),
-        **read_preset(name),
-    )
+        robot=robot.name, **robot_identity(robot), preset=name, policy=named,
+        policy_sha256=controller_hash(resolve_policy(named, robot)), space=space, space_sha256=space_sha256,
+        collision_bit=robot.collision_bit, **read_preset(name),
+        fitness=FitnessCfg(penalties=robot.penalties, scales=scales, disturbances=known),
+    )  # fmt: skip
 
 
 def as_settings(cfg: SearchCfg) -> dict[str, Any]:

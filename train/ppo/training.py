@@ -264,15 +264,8 @@ class Training:
         if not learner.ranks.is_first:
             return
         write_checkpoint(self._run_dir / CHECKPOINT, self.state())
-        record = {
-            **self._origin,
-            "robot": self.task.robot.name,
-            "iterations": learner.iteration,
-            "num_envs": learner.env.num_envs,
-            **self._dump_progress(),
-            "averaged": learner.averaged,
-            **self._facts,
-        }
+        done = {"robot": self.task.robot.name, "iterations": learner.iteration, "num_envs": learner.env.num_envs}
+        record = {**self._origin, **done, **self._dump_progress(), "averaged": learner.averaged, **self._facts}
         for path in filter(None, (self._run_dir / POLICY, export)):
             write_controller(path, learner, record)
             file = path

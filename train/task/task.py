@@ -198,17 +198,11 @@ def _make_task(cfg: TaskCfg, robot: RobotCfg, tiles: Tiles) -> Any:
 
 def _make_rules(cfg: TaskCfg, robot: RobotCfg, tiles: Tiles) -> Any:
     """Commands, pushes and levels of the task as a kernel argument."""
-    return make_struct(
-        Rules,
-        cfg,
-        tiles,
-        crosses=int(cfg.crosses),
-        overflow_mask=CAPACITY_OVERFLOWS,
-        promotion_distance=0.5 * _TILE_SIDE,
-        demotion_time_s=0.5 * cfg.episode_s,
-        command_steps=round(cfg.command_interval_s / robot.control_dt),
-        push_steps=round(cfg.push_interval_s / robot.control_dt),
-    )
+    names = ("command", "push")
+    steps = {f"{name}_steps": round(getattr(cfg, f"{name}_interval_s") / robot.control_dt) for name in names}
+    limits = {"promotion_distance": 0.5 * _TILE_SIDE, "demotion_time_s": 0.5 * cfg.episode_s}
+    limits["overflow_mask"] = CAPACITY_OVERFLOWS
+    return make_struct(Rules, cfg, tiles, crosses=int(cfg.crosses), **limits, **steps)
 
 
 def _make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:
