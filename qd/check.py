@@ -52,10 +52,9 @@ _TRIED = 100  # hard-random terrains at a height, one episode each: terrains dif
 
 
 def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute, why: bool = False) -> bool:
-    """Prints what a robot's files hold, whether it stands and walks, and which obstacles it crosses.
+    """Prints what a robot's files hold, how it stands and walks, and what it crosses; returns whether all is well.
 
-    If it walks badly, or with ``why``, the change of its contract is named with which it walks best. Returns whether
-    nothing has to be mended.
+    If it walks badly, or with ``why``, the change of its contract is named with which it walks best.
     """
     from sim.robots.stand import describe_model  # loads Newton, which takes seconds
 
@@ -219,12 +218,11 @@ def _draw_terrains(count: int, height: float | None) -> Terrains:
 
 
 def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, replicas: int) -> dict[str, Any]:
-    """Measures the penalty scales of a robot with a controller and writes them where a search reads them.
+    """Measures the penalty scales of a robot with a controller and writes them where a search reads them; returns all.
 
     ``terrains`` hard-random ones, for a user's robot of the height that fits, are crossed in each of up to five rounds,
     until 200 episodes have missed the goal. If fewer miss it, all episodes give the scales. A penalty that never
-    occurred is a ValueError, once the others' scales are written; but of a robot.toml, which names all that could
-    occur, it has the scale 1. Returns the content of the file.
+    occurred is a ValueError, once the others' are written; but in a robot.toml, which names all, its scale is 1.
     """
     out = robot.scales_file
     prepare_output(out)

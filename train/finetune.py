@@ -77,10 +77,7 @@ def _write_onnx(policy: Path, robot: RobotCfg) -> Path:
 
 
 def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
-    """Trains the searched controller further, on all elites that it fails in fresh episodes, as a certifier of the run.
-
-    A certificate is a proof of existence, so a certifier may have trained on its terrain.
-    """
+    """Trains a searched controller on all that it fails in fresh episodes, so that it certifies some of these as faults."""
     archive = read_robot_archive(robot, run, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]
     policy = cfg.policy or (None if searched == SHIPPED else searched)

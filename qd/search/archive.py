@@ -1,7 +1,6 @@
 """The archive of a search: a table of terrains that break the controller, one a cell, and the file that holds it.
 
 Its columns come in groups. The search fills the first; each stage of judging (:mod:`qd.faults.judge`) adds one.
-Training and figures read archives without the search's libraries.
 """
 
 import os

@@ -53,10 +53,7 @@ def start_search(
     skip_level_ground: bool = False,
     likely: Path | None = None,
 ) -> tuple[SearchCfg, RobotCfg]:
-    """Settings of a new search by the name of a preset, and its robot, which is checked and has penalty scales then.
-
-    All is as flags take it. A user's robot must cross level ground, unless ``skip_level_ground``.
-    """
+    """Settings of a new search, by a preset's name and flags, and its robot, checked and with penalty scales."""
     terrain_space = load_space(space)
     if height is not None:
         terrain_space = at_height(terrain_space, height)
@@ -82,9 +79,8 @@ def search(
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
     It ends earlier once its last tenth brought a share of the elites below ``until``
-    (:func:`qd.search.results.compute_last_tenth`). Nothing is written before the simulation is built. ``robot`` is
-    given if it is not shipped, ``policy`` if the controller lies elsewhere than ``cfg`` says. The archive is a judged
-    one if nothing was left to do after it.
+    (:func:`qd.search.results.compute_last_tenth`). ``robot`` is given if it is not shipped, ``policy`` if the
+    controller lies elsewhere than ``cfg`` says. The archive is a judged one if nothing was left to do after it.
     """
     robot = robot or get_robot(cfg.robot)
     if unknown := set(cfg.fitness.penalties) - set(robot.penalties):

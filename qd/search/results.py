@@ -65,10 +65,7 @@ def describe_metrics(archive: Archive, result: RolloutResult, evaluation: Evalua
 
 
 def find_last_iteration(cfg: SearchCfg, metrics: Metrics, until: float | None) -> int:
-    """The iteration that ends a search: after one whose last tenth brought too little, all that was asked for settles.
-
-    It follows from the metrics alone, so a search that goes on ends where it would have.
-    """
+    """The iteration that ends a search, by its metrics alone: after a last tenth of too little, all settles."""
     shares = {row["iteration"]: row["last_tenth"] for row in metrics if row["last_tenth"] is not None}
     ends = [number + 1 + cfg.scheduler.settling for number, share in shares.items() if share < (until or 0.0)]
     return min([cfg.iterations, *(end for end in ends if end >= len(metrics))])

@@ -41,11 +41,7 @@ class Asked(NamedTuple):
 
 
 class Scheduler:
-    """The state of a search, which a checkpoint holds: ask for genes, tell what became of them.
-
-    Emitters take the methods in turn. Where terrains are crossed again, the archive has those that hold the cells of a
-    pool.
-    """
+    """The state of a search, which a checkpoint holds: ask for genes, tell what became of them; methods take turns."""
 
     def __init__(
         self, cfg: SchedulerCfg, *, cells: Cells, fitness: FitnessCfg, seed: int, space: TerrainSpace = SUPER_GAUSSIAN
@@ -149,7 +145,7 @@ class Scheduler:
     def ask_crossed(
         self, most: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
-        """Failing elites of which is to be found out whether anybody crosses them, at most so many, drawn at random.
+        """Failing elites that nobody has tried to cross, at most so many, drawn at random.
 
         Rows for :meth:`tell_crossed`, (T,), clipped genes, (T, num_genes), and goal rates, (T,).
         """

@@ -22,10 +22,7 @@ _ROWS = "rows"
 
 
 class Cache:
-    """Arrays in the files of a folder, by key; above ``max_bytes`` the least recently used ones are removed.
-
-    A damaged file counts as absent, in a printed line.
-    """
+    """Arrays in the files of a folder, by key; the least recently used are removed, and a damaged one counts as absent."""
 
     def __init__(self, folder: Path, *, max_bytes: int = MAX_BYTES) -> None:
         self.folder = folder
@@ -84,10 +81,7 @@ class Cache:
 
 
 class StoredCrossings:
-    """Lots in a cache, of which each terrain is found by its digest and seed, in whatever lots it comes again.
-
-    ``settings`` is the hash of all else that its episodes depend on.
-    """
+    """Lots in a cache, by digests of terrains and seeds; ``settings`` hashes all else that episodes depend on."""
 
     def __init__(self, cache: Cache, settings: str, penalty_names: tuple[str, ...]) -> None:
         self._cache, self._settings, self._penalty_names = cache, settings, penalty_names

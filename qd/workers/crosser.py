@@ -1,7 +1,4 @@
-"""The crossing service: controllers cross terrains, in lots that fill the device, and what is done is kept on disk.
-
-A command that was stopped goes on when it is run again, with the crossings in the cache (:mod:`qd.workers.cache`).
-"""
+"""The crossing service: controllers cross terrains, in lots that fill the device, and what is done is kept on disk."""
 
 import hashlib
 import importlib
@@ -94,8 +91,8 @@ class Crosser(ExitStack):
         Penalties are summed from ``penalties_from_s`` of an episode on [s], with ``reward`` the training task's reward
         too; with ``record`` the result has frames. It is not stored then, nor where episodes are steered. The progress
         bar shows ``label``, or ``progress`` gets the share that is done. ``room`` are the terrains of the largest call
-        to come that agrees with this one. Many invalid episodes are reported; a result without a valid one is returned
-        if ``invalid_ok``. Steps and time are those of terrains that were not in the cache.
+        to come that agrees with this one. A result without a valid episode is returned if ``invalid_ok``. Steps and
+        time are those of terrains that were not in the cache.
         """
         if replicas < 1 or engine not in get_args(Engine):
             rule = f"replicas must be 1 or more, engine one of {get_args(Engine)}"
@@ -193,10 +190,7 @@ def cross(
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
 ) -> dict[str, RolloutResult]:
-    """Lets each controller cross each terrain: one result a controller, by its name.
-
-    All else is as :meth:`Crosser.cross` takes it; without ``compute`` the CPU crosses, by a process a core.
-    """
+    """Lets each controller cross each terrain, as :meth:`Crosser.cross` does: one result a controller, by its name."""
     with Crosser(robot, compute or Compute(), cache=cache) as crosser:
         return {
             name: crosser.cross(

@@ -112,8 +112,7 @@ class CommandVecEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Makes one control step with ``actions`` (num_envs, num_actions), without host synchronisation.
 
-        Returns observations, of the new episode if one ended, rewards and dones, and ``{"time_outs": ...}``, the dones
-        that no failure caused; all of shape (num_envs,).
+        Returns observations, rewards, dones, and ``{"time_outs": ...}``, those dones that no failure caused.
         """
         self.task.step(actions if self._described is None else self._described.act(actions))
         end = self.task.end
@@ -141,10 +140,7 @@ class Learner:
     """
 
     def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int, random_ages: bool = True) -> None:
-        """Draws the networks from ``seed``, and later the actions.
-
-        With ``random_ages`` the first episodes begin at random ages, so that they do not end together.
-        """
+        """Draws networks and actions from ``seed``; ``random_ages`` keep the first episodes from ending together."""
         torch.manual_seed(seed)
         torch.set_float32_matmul_precision("high")  # TF32 on CUDA: half the learning time, no measurable loss
         self.env, self.cfg, self._random_ages = env, cfg, random_ages
@@ -179,10 +175,7 @@ class Learner:
         self._observations = self.env.get_observations()
 
     def iterate(self) -> Iteration:
-        """Collects ``steps_per_env`` control steps of every environment, then updates the networks.
-
-        After a FloatingPointError the networks are unusable; the last checkpoint is intact.
-        """
+        """Collects ``steps_per_env`` control steps of every environment, then updates the networks."""
         alg = self.alg
         began = time.perf_counter()
         alg.train_mode()

@@ -69,8 +69,7 @@ class CapturedPPO(PPO):
     def begin_actor(self) -> None:
         """Resets the optimiser's moments of the actor, and lets it learn in small steps at first.
 
-        Adam's second moment has counted the zero gradients while the critic learned alone, so that the first steps
-        would be three times too large.
+        They have counted zero gradients while the critic learned alone: first steps would be three times too large.
         """
         for parameter in self.actor.parameters():
             for value in self.optimizer.state.get(parameter, {}).values():

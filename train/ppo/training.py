@@ -154,9 +154,6 @@ def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
 class Training:
     """A training, of a base controller or, with a mix of terrains, a fine-tuning.
 
-    Iterations are collected into rows, which are printed, written to TensorBoard and recorded; only the first of
-    several processes prints and writes.
-
     Attributes:
         critic_iterations: First iterations, in which the critic learns alone.
         averaged_from: The iteration after which actors count into the controller.

@@ -43,15 +43,11 @@ _TILE_CENTRE = (8.0, 4.0)
 class CommandTask:
     """``num_envs`` robots following commands on the tiles of the curriculum.
 
-    Torch tensors below are views of the memory the graph works in: the next step overwrites them. They have a row an
-    environment.
+    Attributes are views of the memory the graph works in, of a row an environment: the next step overwrites them.
 
     Attributes:
-        observation: Shape (num_envs, observation_size).
-        reward: Of the step just made.
-        end: How the episode ended with it (:class:`kernels.episode.Outcome`), int32.
+        end: How the episode ended with the step just made (:class:`kernels.episode.Outcome`), int32.
         episode_steps: Control steps of the episode so far, int32.
-        levels: Terrain level, int32.
         counter: Control steps since the seed's first number: the state of all random numbers, int32, shape (1,).
     """
 

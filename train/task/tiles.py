@@ -102,11 +102,7 @@ class Mix:
         self._before_resume = np.zeros((2, self.num_elites), np.int64)
 
     def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
-        """The terrains of the next exchange.
-
-        ``counts`` of the present terrains (:meth:`train.task.task.CommandTask.counts`) replace older ones of the same
-        elites, which were of the controller at that time.
-        """
+        """The next terrains; ``counts`` of the present ones replace those that their elites had before."""
         if counts is not None:
             episodes, crossed = self._count_present(counts)
             self.episodes = np.where(episodes > 0, episodes, self.episodes)

@@ -65,8 +65,7 @@ class Prediction(NamedTuple):
 class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
 
-    ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`. With ``crossed`` in the ``fitness``, networks
-    also learn whether anybody crosses a terrain.
+    With ``crossed`` in the ``fitness``, networks also learn whether anybody crosses a terrain.
     """
 
     def __init__(
@@ -375,10 +374,7 @@ def label_loss(logits: Tensor, labels: Tensor) -> Tensor:
 
 
 def vary_elites(pool: Tensor, count: int, cfg: Any, genes_per_part: int | None, draw: torch.Generator) -> Tensor:
-    """Children, (count, num_genes), of elites, (E, num_genes), by iso+line; in [-1, 1].
-
-    Where the space has parts, a share of the children takes each from a third elite with a chance of a half.
-    """
+    """Children, (count, num_genes), of elites by iso+line; a share takes parts, where there are any, from a third elite."""
     options = {"generator": draw, "device": pool.device}
     first, second, third = pool[torch.randint(len(pool), (3, count), **options)]
     noise = cfg.iso_sigma * torch.randn(first.shape, **options)
