@@ -77,7 +77,7 @@ def _write_onnx(policy: Path, robot: RobotCfg) -> Path:
 
 
 def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
-    """Trains a searched controller on all that it fails in fresh episodes, so that it certifies some of these as faults."""
+    """Trains a searched controller on all that it fails in fresh episodes, to be a certifier of its run."""
     archive = read_robot_archive(robot, run, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]
     policy = cfg.policy or (None if searched == SHIPPED else searched)

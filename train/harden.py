@@ -213,7 +213,7 @@ class _Hardening:
 
 
 def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, float]) -> dict[str, Any]:
-    """Whether to keep the controller ``after`` a training, by goal rates of validation sets; their mean is its score."""
+    """Whether to keep the controller ``after`` a training, by goal rates of validation sets, and their mean."""
     scores = {"before": fmean(before.values()), "after": fmean(after.values())}
     why = f"its goal rate on validation is {scores['after']:.3f}, before {scores['before']:.3f}"
     lost = {name: base[name] - after[name] for name in FIXED_SETS if base[name] - after[name] > MOST_LOST + 1e-9}

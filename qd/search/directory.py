@@ -199,7 +199,7 @@ class RunDirectory:
         write_archive(self.path, archive)
 
     def load(self, cfg: SearchCfg) -> tuple[Any, Metrics]:
-        """Scheduler and metrics of the search to go on with, (None, []) without a checkpoint; refuses another search."""
+        """Scheduler and metrics of the search to go on with, (None, []) without a checkpoint; refuses other searches."""
         if not self.exists():
             if not all(map(is_leftover, self.path.iterdir())):
                 raise ValueError(f"{self.path} is not empty and holds no run: give another --run-dir")

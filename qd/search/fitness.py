@@ -116,7 +116,10 @@ class Evaluation(ColumnTable):
 
     @property
     def collides(self) -> NDArray[np.bool_]:
-        """The collision bit, shape (T,): whether 20 episodes, or any of up to 29, sooner have a base collision than not."""
+        """The collision bit, shape (T,): whether 20 episodes sooner have a base collision than not.
+
+        With up to 29 episodes, it says whether any of them has one.
+        """
         return self.collision_rate > 1.0 - 0.5 ** (1.0 / BIT_EPISODES)
 
     @property

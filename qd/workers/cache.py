@@ -22,7 +22,7 @@ _ROWS = "rows"
 
 
 class Cache:
-    """Arrays in the files of a folder, by key; the least recently used are removed, and a damaged one counts as absent."""
+    """Arrays in the files of a folder, by key; the least recently used are removed, a damaged one counts as absent."""
 
     def __init__(self, folder: Path, *, max_bytes: int = MAX_BYTES) -> None:
         self.folder = folder

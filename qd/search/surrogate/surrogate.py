@@ -374,7 +374,7 @@ def label_loss(logits: Tensor, labels: Tensor) -> Tensor:
 
 
 def vary_elites(pool: Tensor, count: int, cfg: Any, genes_per_part: int | None, draw: torch.Generator) -> Tensor:
-    """Children, (count, num_genes), of elites by iso+line; a share takes parts, where there are any, from a third elite."""
+    """Children, (count, num_genes), of elites by iso+line; a share of them takes parts from a third elite."""
     options = {"generator": draw, "device": pool.device}
     first, second, third = pool[torch.randint(len(pool), (3, count), **options)]
     noise = cfg.iso_sigma * torch.randn(first.shape, **options)
