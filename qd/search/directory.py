@@ -199,7 +199,7 @@ class RunDirectory:
         write_archive(self.path, archive)
 
     def load(self, cfg: SearchCfg) -> tuple[Any, Metrics]:
-        """Scheduler and metrics of the search to go on with, (None, []) without a checkpoint; refuses other searches."""
+        """Scheduler and metrics of the search to go on with, (None, []) without a checkpoint; refuses another one."""
         if not self.exists():
             if not all(map(is_leftover, self.path.iterdir())):
                 raise ValueError(f"{self.path} is not empty and holds no run: give another --run-dir")
@@ -214,14 +214,17 @@ class RunDirectory:
         settings, metrics, scheduler = (state.get(name) for name in ("settings", "metrics", "scheduler"))
         if not isinstance(settings, dict) or not isinstance(metrics, list) or scheduler is None:
             raise ValueError(f"{file} must have settings, metrics and a scheduler, got {', '.join(state)}; {REMEDY}")
-        _refuse_differences(file, settings, cfg)
+        self.check_settings(cfg, settings, file)
         if (done := len(metrics)) > (wanted := cfg.iterations):
             raise ValueError(f"iterations must be at least {done}, as many as {self.path} has done, got {wanted}")
         return scheduler, metrics
 
-    def check_settings(self, cfg: SearchCfg) -> None:
-        """Refuses the run of another search."""
-        _refuse_differences(self.path, as_settings(self.read_cfg()), cfg)
+    def check_settings(self, cfg: SearchCfg, stored: dict[str, Any] | None = None, file: Path | None = None) -> None:
+        """Refuses the run of another search, by the settings that a ``file`` stored, or by its config."""
+        stored = as_settings(self.read_cfg()) if stored is None else stored
+        if different := differences(stored, as_settings(cfg)):
+            text = f"{file or self.path} is of other settings: {', '.join(different)}"
+            raise ValueError(f"{text}: start a new run for those")
 
     def read_summary(self) -> dict[str, Any]:
         """The run in numbers; nothing where they were not written or are damaged, as they are made again."""
@@ -240,8 +243,3 @@ class RunDirectory:
         if not rows or not all(isinstance(row, dict) for row in rows):
             raise ValueError(f"{file} must have a row an iteration, got {len(rows)}; {REMEDY}")
         return rows
-
-
-def _refuse_differences(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:
-    if different := differences(settings, as_settings(cfg)):
-        raise ValueError(f"{file} is of other settings: {', '.join(different)}: start a new run for those")

@@ -82,7 +82,7 @@ class Pool:
     ) -> Evaluation:
         """Takes in what crossings of T terrains showed, and returns what is known of these now.
 
-        Solutions are unclipped genes, (T, num_genes); ``number`` is -1 of new ones, else theirs, at times repeated, (T,).
+        Solutions are unclipped genes, (T, num_genes); ``number`` is -1 of new ones, else theirs, even repeated, (T,).
         """
         merged = crossed.rows(np.arange(len(number)))
         new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)

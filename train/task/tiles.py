@@ -71,34 +71,26 @@ class TrainingElites:
     """Sizes and hash of each archive, for the record."""
 
 
-@dataclass(kw_only=True)
 class Mix:
     """Draws the terrains of each exchange, and counts how often each elite was crossed when it was last trained on.
 
     A checkpoint has all that a draw depends on, so a resumed training goes on with the same terrains.
+
+    Attributes:
+        goal_rate: Goal rate of each elite, shape (E,), until the elite is trained on; None: 0.
+        swap: Number of the present exchange, from 0.
+        rows: Present elites, in the order of their terrains after the hand-crafted ones.
+        episodes: Valid episodes on each elite when it was last trained on before the present exchange, shape (E,).
+        crossed: How many of them reached the goal.
     """
 
-    cfg: FinetuneCfg
-    elites: TrainingElites
-    """Hand-crafted terrains are scaled by the smallest height share of their spaces."""
-    device: str
-    goal_rate: NDArray[np.float64] | None = field(init=False)
-    """Goal rate of each elite, shape (E,), which ``learnable`` uses until the elite is trained on; None: 0."""
-    swap: int = -1
-    """Number of the present exchange, from 0."""
-    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Present elites, in the order of their terrains after the hand-crafted ones."""
-    episodes: NDArray[np.int64] = field(init=False)
-    """Valid episodes on each elite when it was last trained on before the present exchange, shape (E,)."""
-    crossed: NDArray[np.int64] = field(init=False)
-    """How many of them reached the goal."""
-
-    def __post_init__(self) -> None:
-        self.num_elites = sum(map(len, self.elites.genes))
-        self.goal_rate = self.elites.goal_rate if self.cfg.recipe.draw == "learnable" else None
-        self.num_hand_crafted = self.cfg.terrains if self.cfg.mix == "hand-crafted" else self.cfg.terrains // 2
-        self.episodes = np.zeros(self.num_elites, np.int64)
-        self.crossed = np.zeros(self.num_elites, np.int64)
+    def __init__(self, cfg: FinetuneCfg, elites: TrainingElites, device: str) -> None:
+        self.cfg, self.elites, self.device = cfg, elites, device
+        self.num_elites = sum(map(len, elites.genes))
+        self.num_hand_crafted = cfg.terrains if cfg.mix == "hand-crafted" else cfg.terrains // 2
+        self.goal_rate = elites.goal_rate if cfg.recipe.draw == "learnable" else None
+        self.swap, self.rows = -1, np.zeros(0, np.int64)
+        self.episodes, self.crossed = np.zeros((2, self.num_elites), np.int64)
         self._before_resume = np.zeros((2, self.num_elites), np.int64)
 
     def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
