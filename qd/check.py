@@ -52,10 +52,9 @@ _TRIED = 100  # hard-random terrains at a height, one episode each: terrains dif
 
 
 def check_robot(robot: RobotCfg, policy: str | None = None, *, compute: Compute, why: bool = False) -> bool:
-    """Prints what a robot's files hold, whether it stands and walks, and which obstacles it crosses.
+    """Prints what a robot's files hold, how it stands and walks, and what it crosses; returns whether all is well.
 
-    Without ``policy`` it walks by the controller beside its settings. If it walks badly, or with ``why``, the change of
-    its contract is named with which it walks best. Returns whether nothing has to be mended.
+    If it walks badly, or with ``why``, the change of its contract is named with which it walks best.
     """
     from sim.robots.stand import describe_model  # loads Newton, which takes seconds
 
@@ -194,9 +193,7 @@ def find_fitting_height(crosser: Crosser, policy: str, *, room: int = 0) -> tupl
     """The largest height [m] at which a controller crosses 80 % of hard-random terrains, and the share at that height.
 
     ``room`` is for terrains of a later call, as :meth:`qd.workers.crosser.Crosser.cross` has it.
-
-    Terrain of the shipped heights is for robots half a metre high: a smaller one, or one that learned to walk on flat
-    ground, fails everywhere on it, and a search says nothing. The least height is 2 cm.
+    On terrain of the shipped heights a small robot, or one that learned on flat ground, would fail everywhere.
     """
     shares = dict[float, float]()
 
@@ -222,12 +219,11 @@ def _draw_terrains(count: int, height: float | None) -> Terrains:
 
 
 def calibrate(robot: RobotCfg, policy: str, *, compute: Compute, terrains: int, replicas: int) -> dict[str, Any]:
-    """Measures the penalty scales of a robot with a controller and writes them where a search reads them.
+    """Measures the penalty scales of a robot with a controller and writes them where a search reads them; returns all.
 
-    Terrains of a user's robot are of the height that fits (:func:`find_fitting_height`). ``terrains`` hard-random ones
-    are crossed in each of up to five rounds, until 200 episodes have missed the goal. If fewer miss it, all episodes
-    give the scales. A penalty that never occurred is a ValueError, once the others' scales are written; but in a
-    robot.toml, which names all that could occur, it has the scale 1. Returns the content of the file.
+    ``terrains`` hard-random ones, for a user's robot of the height that fits, are crossed in each of up to five rounds,
+    until 200 episodes have missed the goal. If fewer miss it, all episodes give the scales. A penalty that never
+    occurred is a ValueError, once the others' are written; but in a robot.toml, which names all, its scale is 1.
     """
     out = robot.scales_file
     prepare_output(out)

@@ -18,18 +18,9 @@ from sim.files.command import command_line
 from sim.robots.robot import RobotCfg
 from sim.terrains.spaces.registry import load_space, space_at, space_key
 from train.cfg import RUN, SPECIALIST, FinetuneCfg, RunCfg
+from train.ppo import training
 from train.ppo.checkpoint import CHECKPOINT, POLICY, STD, Start, read_start
 from train.ppo.learner import Ranks
-from train.ppo.training import (
-    DESCRIBED,
-    Training,
-    check_resumed,
-    dump_settings,
-    find_device,
-    is_finished,
-    read_saved,
-    run_directory,
-)
 from train.task.tiles import Mix, TrainingElites
 
 _CRITIC_ITERATIONS = 50
@@ -38,15 +29,15 @@ _CRITIC_ITERATIONS = 50
 def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN) -> Path:
     """Trains a controller further by PPO, on hand-crafted terrains and on those of archives; returns its file.
 
-    If the directory holds a checkpoint of the same settings, the training goes on; a finished one is left as it is.
-    ``run_dir`` gets checkpoint, controller, record and TensorBoard's file. ``run`` has the device and an export.
+    It goes on where the directory holds a checkpoint of the same settings; a finished training is left as it is.
+    ``run_dir`` gets checkpoint, controller, record and TensorBoard's file.
     """
-    device = find_device(run.device)
+    device = training.find_device(run.device)
     if Ranks.from_environment().size > 1:
         raise ValueError("a fine-tuning must be one process, got several by torchrun: begin it without")
     cfg = cfg.sized(robot, device)
     checkpoint = run_dir / CHECKPOINT
-    saved = read_saved(run_dir, "finetune", robot.name) if checkpoint.exists() else None
+    saved = training.read_saved(run_dir, "finetune", robot.name) if checkpoint.exists() else None
     # The first controller of a training that goes on may be gone.
     start = read_start(Path(cfg.policy or robot.policy_file) if saved is None else checkpoint, robot)
     if saved is None and cfg.recipe.noise_of is not None:
@@ -55,30 +46,26 @@ def finetune(robot: RobotCfg, cfg: FinetuneCfg, run_dir: Path, run: RunCfg = RUN
     cfg = replace(cfg, ppo=replace(cfg.ppo, hidden_dims=start.hidden_dims))
     elites = find_training_elites(robot, cfg)
     settings = {
-        **dump_settings(cfg, robot),
+        **training.dump_settings(cfg, robot),
         "elites": elites.archives,
         "spaces": list(dict.fromkeys(space_key(space.name, space.sha256) for space in elites.spaces)),
     }
     if saved is not None:
-        check_resumed(run_dir, saved, settings)
-        if is_finished(run_dir, cfg.iterations, run.export):
+        training.check_resumed(run_dir, saved, settings)
+        if training.is_finished(run_dir, cfg.iterations, run.export):
             print(f"{run_dir} is finished: all {cfg.iterations} iterations are done; with more it goes on.")
-            return _write_onnx(run_dir / (POLICY if start.controller is None else DESCRIBED), robot)
-    if start.controller is not None and saved is None and run.export is not None:
-        description = run.export.with_suffix(".toml")
-        if description.exists():
-            raise ValueError(f"export also writes {description}, which exists: name another file")
-    with run_directory(run_dir, run.export):
+            return _write_onnx(run_dir / (POLICY if start.controller is None else training.DESCRIBED), robot)
+    if start.controller and saved is None and run.export and (file := run.export.with_suffix(".toml")).exists():
+        raise ValueError(f"export also writes {file}, which exists: name another file")
+    with training.run_directory(run_dir, run.export):
         sizes = f"{cfg.num_envs} robots on {device}, {cfg.iterations} iterations"
         terrains = f"{cfg.terrains} terrains at a time ({cfg.mix})"
         print(f"Fine-tuning '{robot.name}' on {terrains}: {sizes}, in {run_dir}", flush=True)
-        if saved is None:
-            facts = first_facts(robot, cfg, elites, start)
-        else:
-            facts = {name: saved[name] for name in (TRAINED_ON, "critic_iterations")}
+        facts = saved or first_facts(robot, cfg, elites, start)
+        facts = {name: facts[name] for name in (TRAINED_ON, "critic_iterations")}
         mix = Mix(cfg=cfg, elites=elites, device=device)
         how = {"settings": settings, "saved": saved, "mix": mix, "facts": facts, "start": start}
-        policy = Training(robot, cfg, run_dir, device=device, **how).run(run.export)
+        policy = training.Training(robot, cfg, run_dir, device=device, **how).run(run.export)
     return _write_onnx(policy, robot)
 
 
@@ -90,18 +77,16 @@ def _write_onnx(policy: Path, robot: RobotCfg) -> Path:
 
 
 def train_specialist(robot: RobotCfg, run: Path, cfg: FinetuneCfg, options: RunCfg = RUN) -> None:
-    """Trains a search's specialist, by :meth:`FinetuneCfg.specialist`, and writes it to the certifiers of the run.
-
-    It is the controller of the search, trained further on all elites that it fails in fresh episodes, in
-    ``<run>/specialist``. A certificate is a proof of existence, so a certifier may have trained on its terrain.
-    """
+    """Trains a searched controller on all that it fails in fresh episodes, to be a certifier of its run."""
     archive = read_robot_archive(robot, run, cfg.space)
     searched = RunDirectory(run).read_config()["settings"]["policy"]
     policy = cfg.policy or (None if searched == SHIPPED else searched)
     if controller_hash(policy or robot.policy_file) != archive.policy_sha256:
         rule = f"policy must be the controller that {run} searched"
         raise ValueError(f"{rule}, got {policy or SHIPPED}, whose file differs: name it by --policy")
-    cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(robot, find_device(options.device), **SPECIALIST)
+    cfg = replace(cfg, policy=policy, archive=(str(run),)).sized(
+        robot, training.find_device(options.device), **SPECIALIST
+    )
     specialist = run / CERTIFIERS_FOLDER / f"{CERTIFIER}.pt"
     finetune(robot, cfg, run / "specialist", replace(options, export=specialist))
 
@@ -117,9 +102,7 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
     held_out = set[str]()  # searches that begin alike may share an elite
     for archive, split in zip(archives, splits, strict=True):
         held_out.update(hash_elites(archive.genes[np.concatenate([split.test, split.validation])]))
-    genes = []
-    goal_rates = []
-    records = []
+    genes, goal_rates, records = [], [], []
     for archive, split, path in zip(archives, splits, paths, strict=True):
         rows = split.train
         if cfg.recipe.only == "failing":
@@ -143,11 +126,8 @@ def find_training_elites(robot: RobotCfg, cfg: FinetuneCfg) -> TrainingElites:
 
 def first_facts(robot: RobotCfg, cfg: FinetuneCfg, elites: TrainingElites, start: Start) -> dict[str, Any]:
     """What checkpoint and record of a new fine-tuning say beside its settings."""
-    critic_iterations = cfg.recipe.critic_iterations
-    if critic_iterations is None:
-        critic_iterations = min(_CRITIC_ITERATIONS, cfg.iterations // 2)
+    alone = cfg.recipe.critic_iterations
+    alone = min(_CRITIC_ITERATIONS, cfg.iterations // 2) if alone is None else alone
     trained_before = read_trained_on(str(cfg.policy or robot.policy_file))
-    return {
-        TRAINED_ON: sorted({*chain(*map(hash_elites, elites.genes)), *trained_before}),
-        "critic_iterations": critic_iterations if start.critic is None else 0,
-    }
+    trained_on = sorted({*chain(*map(hash_elites, elites.genes)), *trained_before})
+    return {TRAINED_ON: trained_on, "critic_iterations": 0 if start.critic else alone}

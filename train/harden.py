@@ -1,7 +1,6 @@
 """Harden a controller: rounds of search and training, until a search no longer finds what breaks it.
 
-Every step is a run of its own under the directory of the hardening: search-0, tune-1, search-1 and so on. One that was
-stopped is begun again and does what is left.
+Every step is a run of its own under the directory of the hardening, search-0, tune-1 and so on, and goes on if stopped.
 """
 
 import json
@@ -54,8 +53,7 @@ def harden(
     """Searches for what breaks a controller, trains it on all that was found, and searches again, for some rounds.
 
     Each training is on hand-crafted terrains and on the archives of all searches so far. Its controller is kept if
-    validation terrains speak for it; else the next round goes on with the controller before. Every controller is
-    evaluated on hand-crafted and hard-random terrains and on elites of every archive that no training draws.
+    validation terrains speak for it; else the next round goes on with the controller before.
 
     ``certifiers`` are controllers by name that judge the searches; those of :func:`qd.faults.judge.judge` if None.
     Returns the content of ``rounds.json``: the counts of all searches, which trainings were kept and why, and tables.
@@ -101,13 +99,10 @@ class _Hardening:
         terrains, episodes = cfg.evaluation.terrains or None, cfg.evaluation.episodes or None
         terrains, episodes = fill_sizes(compute, terrains, episodes, full=full, small=(24, 4))
         self.cfg = replace(cfg, tune=tune, evaluation=RoundEvaluationCfg(terrains=terrains, episodes=episodes))
-        self.robot = robot
-        self.path = path
-        self.compute = compute
-        self.certifiers = certifiers
+        self.robot, self.path, self.compute, self.certifiers = robot, path, compute, certifiers
         self.space = space_at(load_space(cfg.space), None, robot)
-        self.crossing: dict[str, Any] = {"robot": robot, "compute": compute, "episodes": episodes}
-        self.crossing["cache"] = path / "crossings"
+        how: dict[str, Any] = {"robot": robot, "compute": compute, "episodes": episodes, "cache": path / "crossings"}
+        self.crossing = how
         self.policies = {"base": base}  # after each round so far
         self.start = cfg.policy  # of the next training: the base, or the last checkpoint kept, with its critic
         self.rows: list[dict[str, Any]] = []
@@ -153,11 +148,10 @@ class _Hardening:
         base = self.policies["base"]
         # Noise of the actions grows in a training: each begins with that of the base.
         recipe = replace(self.cfg.tune.recipe, noise_of=base if self.start != self.cfg.policy else None)
-        cfg = replace(self.cfg.tune, seed=self._seed(number), policy=self.start, space=self.space.name, recipe=recipe)
-        cfg = replace(cfg, archive=tuple(map(str, searches)))
+        drawn = {"archive": tuple(map(str, searches)), "space": self.space.name}
+        cfg = replace(self.cfg.tune, seed=self._seed(number), policy=self.start, recipe=recipe, **drawn)
         after = str(finetune(self.robot, cfg, run, RunCfg(device=self.compute.device)))
-        before = list(self.policies.values())[-1]
-        controllers = {"base": base, "before": before, "after": after}
+        controllers = {"base": base, "before": [*self.policies.values()][-1], "after": after}
         sets = self._sets(searches, "validation")
         results = cross_sets(controllers, sets, reward=True, note=", validation", **self.crossing)
         goal: dict[str, dict[str, float]] = {}
@@ -171,7 +165,7 @@ class _Hardening:
         print(f"{run.name} is {'kept' if choice['kept'] else 'not kept'}: {choice['why']}", flush=True)
         if choice["kept"]:
             self.start = str(run / CHECKPOINT)
-        self.policies[f"round-{number}"] = after if choice["kept"] else before
+        self.policies[f"round-{number}"] = controllers["after" if choice["kept"] else "before"]
 
     def _sets(self, searches: Sequence[Path], purpose: Purpose) -> dict[str, TerrainSet]:
         """The fixed sets, and for each search, by its name, the elites that no training draws."""
@@ -184,9 +178,8 @@ class _Hardening:
 
     def search(self, number: int) -> None:
         """Searches for what breaks the controller of a round, and counts its faults."""
-        run, name = self.path / f"search-{number}", list(self.policies)[-1]
+        run, (name, policy) = self.path / f"search-{number}", [*self.policies.items()][-1]
         print(f"\n=== {name}: search, in {run}", flush=True)
-        policy = self.policies[name]
         cfg = self.search_cfg(number, self.cfg.policy if policy == self.policies["base"] else policy)
         search(cfg, run, self.compute, robot=self.robot)
         settings: dict[str, Any] = {"compute": self.compute, "robot": self.robot.spec, "space": self.space.name}
@@ -194,8 +187,7 @@ class _Hardening:
             specialist = replace(FinetuneCfg.specialist(self.robot), space=self.space.name)
             train_specialist(self.robot, run, specialist, RunCfg(device=self.compute.device))
         judge(run, certifiers=self.certifiers, **settings)
-        counts = RunDirectory(run).read_summary()
-        identity = controller_identity(self.robot, policy)
+        counts, identity = RunDirectory(run).read_summary(), controller_identity(self.robot, policy)
         tuned = f"tune-{number}" if number else None
         row = {"controller": name, **{key: identity[key] for key in ("policy", "policy_sha256")}}
         row |= {"tuned": tuned, "kept": tuned and self.choices[tuned]["kept"], "search": run.name}
@@ -220,11 +212,7 @@ class _Hardening:
 
 
 def verdict(base: dict[str, float], before: dict[str, float], after: dict[str, float]) -> dict[str, Any]:
-    """Whether to keep the controller ``after`` a training, by goal rates of each validation set.
-
-    Two trainings of one recipe differ by several points, and a training may end worse than it began. The ``score`` is
-    the mean over the sets.
-    """
+    """Whether to keep the controller ``after`` a training, by goal rates of validation sets, and their mean."""
     scores = {"before": fmean(before.values()), "after": fmean(after.values())}
     why = f"its goal rate on validation is {scores['after']:.3f}, before {scores['before']:.3f}"
     lost = {name: base[name] - after[name] for name in FIXED_SETS if base[name] - after[name] > MOST_LOST + 1e-9}

@@ -1,7 +1,6 @@
 """The archive of a search: a table of terrains that break the controller, one a cell, and the file that holds it.
 
 Its columns come in groups. The search fills the first; each stage of judging (:mod:`qd.faults.judge`) adds one.
-Training and figures read archives without the search's libraries.
 """
 
 import os
@@ -54,9 +53,8 @@ class Witnesses(ColumnTable):
     way: NDArray[np.float32]
     """:data:`kernels.episode.STEERING` by segment, shape (N, SEGMENTS, 3)."""
     counts: NDArray[np.int64]
-    """Episodes that reach the goal on the line, beside it, and at all, and valid ones; shape (N, 2, 2, 4).
-
-    At the search's settings and with contact resolved, under the plain command and steered."""
+    """Episodes that reach the goal on the line, beside it, and at all, and valid ones; shape (N, 2, 2, 4), at the
+    search's settings and with contact resolved, under the plain command and steered."""
     limit_m: float
     """Largest distance from the straight line of a way on the line [m]."""
 
@@ -75,13 +73,9 @@ class Witnesses(ColumnTable):
 
 def no_witnesses(count: int, limit_m: float) -> Witnesses:
     """Witnesses of elites that nobody has tried."""
-    return Witnesses(
-        walker=np.full(count, "", "<U255"),
-        kind=np.zeros(count, np.int64),
-        way=np.zeros((count, SEGMENTS, len(STEERING)), np.float32),
-        counts=np.zeros((count, 2, 2, 4), np.int64),
-        limit_m=limit_m,
-    )
+    way = np.zeros((count, SEGMENTS, len(STEERING)), np.float32)
+    kind, counts = np.zeros(count, np.int64), np.zeros((count, 2, 2, 4), np.int64)
+    return Witnesses(walker=np.full(count, "", "<U255"), kind=kind, way=way, counts=counts, limit_m=limit_m)
 
 
 OUTCOMES = ("goal", "base_collision", "other", "invalid")
@@ -89,12 +83,8 @@ OUTCOMES = ("goal", "base_collision", "other", "invalid")
 
 
 def goal_rates(counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Share of valid episodes that reached the goal, shape (...), of counts of shape (..., 4).
-
-    NaN where nothing was crossed, or too many episodes are invalid.
-    """
-    episodes = counts.sum(axis=-1)
-    invalid = counts[..., OUTCOMES.index("invalid")]
+    """Share of valid episodes that reached the goal, of counts (..., 4); NaN where too few, or none, are valid."""
+    episodes, invalid = counts.sum(axis=-1), counts[..., OUTCOMES.index("invalid")]
     is_known = (episodes > 0) & (invalid <= MAX_INVALID_SHARE * episodes)
     return np.where(is_known, counts[..., 0] / np.maximum(episodes - invalid, 1), np.nan)
 
@@ -125,7 +115,6 @@ class Subject:
     space_sha256: str | None = None
     """Hash of its code if it is a user's own."""
     intervals: PositiveInt = 10
-    """Intervals of each ratio."""
     collision_bit: bool
     """Whether base collision is a descriptor of its own."""
 
@@ -239,10 +228,7 @@ class Archive(Evaluation, Subject):
 
     @property
     def strong(self) -> NDArray[np.bool_]:
-        """Whether a fault is a strong one, shape (N,).
-
-        With both kinds of physics the controller crosses under a fifth of the time, and a certifier over four fifths.
-        """
+        """Whether the controller crosses a fault under a fifth of the time, and a certifier over four fifths, (N,)."""
         if self.fresh is None:
             return np.zeros(len(self), bool)
         searched = np.maximum(self.fresh.goal_rate, goal_rates(self.resolved_outcomes))
@@ -260,7 +246,7 @@ class Archive(Evaluation, Subject):
         return self._is_fault_by(self.mujoco_c)
 
     def _is_fault_by(self, again: CrossedAgain | None) -> NDArray[np.bool_]:
-        """Faults of which the controller crosses under half by other outcomes, and what certifies it at least half."""
+        """Whether a fault is one by other outcomes too."""
         if again is None:
             return np.zeros(len(self), bool)
         crosses = self.certificates & (goal_rates(again.certifiers) >= FAILING_GOAL_RATE)

@@ -1,8 +1,7 @@
 """Checkpoints: the whole state of a search in one file that is checked before it is read, and read as data.
 
-A file is a line of magic, the SHA-256 of the rest, and a pickle, which is not compressed: that would take longer than a
-search can wait. The hash finds damage; against files made to harm, the unpickler builds only the classes listed here,
-none of which runs code or opens files when built.
+A file is a line of magic, the SHA-256 of the rest, and a pickle. The hash finds damage; against files made to harm, the
+unpickler builds only the classes listed here, none of which runs code or opens files when built.
 """
 
 import hashlib

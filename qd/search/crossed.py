@@ -1,8 +1,8 @@
 """Whether anybody crosses what stops the searched controller: labels, from which a surrogate learns what earns less.
 
 After iterations 1, 2, 4, 8 and so on, failing elites are drawn at random. Somebody crosses one if the searched
-controller has reached its goal before, or a controller of the robot's panel does in at least half of a few episodes, or
-the searched one does in any, by random ways near the line (:mod:`qd.faults.steer`). That is no certificate.
+controller has reached its goal before, or does by random ways near the line (:mod:`qd.faults.steer`), or a controller
+of the robot's panel does in at least half of a few episodes. That is no certificate.
 """
 
 from collections import defaultdict
@@ -65,10 +65,7 @@ class Labeller(ExitStack):
         self._crossers = defaultdict[str, Crosser](lambda: self.enter_context(Crosser(robot, compute)))
 
     def label(self, scheduler: Scheduler, iteration: int, show: Callable[[str], None]) -> dict[str, Any]:
-        """Tells the search which of some elites somebody crosses; how many they are, and what that took in episodes.
-
-        ``show`` gets a line that says how far that is.
-        """
+        """Tells the search which of some elites somebody crosses; how many they are, and what that took in episodes."""
         counts: dict[str, Any] = {"labelled": 0, "labelled_crossed": 0, "label_episodes": 0, "panel": self._hashes}
         if iteration & (iteration - 1):
             return counts

@@ -17,9 +17,8 @@ _SUM_TOLERANCE = 1e-9  # a mean over 20 episodes of ratios that sum to 1 is off 
 def terrain_ratios(penalties: ArrayLike, valid: ArrayLike) -> NDArray[np.float64]:
     """Mean over a terrain's valid episodes of each penalty's share in the sum of an episode's penalties.
 
-    Scaled penalties are not negative, shape (num_terrains, replicas, num_penalties), and may be anything in
-    episodes that are not ``valid``, shape (num_terrains, replicas). Ratios have shape (num_terrains,
-    num_penalties), each row sums to 1. They are equal in an episode without any, and where no episode is valid.
+    Scaled penalties are not negative, shape (T, R, P), but anything in episodes that are not ``valid``, shape (T, R).
+    Ratios have shape (T, P), each row sums to 1. They are equal in an episode without any, and where none is valid.
     """
     valid = np.asarray(valid, dtype=bool)[..., None]
     penalties = np.where(valid, np.asarray(penalties, dtype=np.float64), 0.0)

@@ -1,7 +1,7 @@
 """The directory of a search's run: where it is, what it was asked to do, how far it is, and what it found.
 
-The checkpoint is the one truth and is written first. Metrics and archive are made from it, and made again when a search
-goes on, so a run that was killed between any two writes goes on as if nothing had been.
+The checkpoint is the one truth and is written first. Metrics and archive are made from it, and again when a search goes
+on, so a run that was killed between any two writes goes on as if nothing had been.
 """
 
 import itertools
@@ -64,7 +64,6 @@ def find_run(
 
 
 def _is_published(path: Path) -> bool:
-    """Whether a run lies among those that are published."""
     return results_folder().resolve() in path.resolve().parents
 
 
@@ -89,10 +88,7 @@ def search_seed(run: Path) -> int | None:
 
 
 def read_robot_archive(robot: RobotCfg, run: Path, space: str | None = None) -> Archive:
-    """The archive of a search against a robot as it is now.
-
-    ``space`` is the terrain space that the command line names, for one of a user's own.
-    """
+    """The archive of a search against a robot as it is now; ``space`` is named for one of a user's own."""
     archive = read_archive(run)
     check_space(archive, space)
     if archive.robot != robot.name:
@@ -120,10 +116,7 @@ def check_config(archive: Archive, cfg: SearchCfg, folder: Path) -> None:
 
 
 def output_folder(run: Path, robot: str) -> Path:
-    """Folder for what is made from a run: its directory; for a published run a folder below runs/.
-
-    That is runs/<robot>-published, for results/<robot>/spaces/course it is runs/<robot>-published-course.
-    """
+    """Folder for what is made from a run: its directory; for a published run runs/<robot>-published-<its name>."""
     folder = find_directory(run)
     if not _is_published(folder):
         return folder
@@ -186,10 +179,7 @@ class RunDirectory:
             raise ValueError(text) from None
 
     def begin_session(self, cfg: SearchCfg, origin: dict[str, Any], done: int) -> None:
-        """Writes what the run is asked to do from now on, after ``done`` iterations.
-
-        ``origin`` is the provenance of this session; of the first one it is the run's.
-        """
+        """Writes what the run is asked to do from now on, after ``done`` iterations; ``origin`` is the provenance."""
         config = self.read_config() if self.exists() else {**origin, "sessions": []}
         session = {name: origin[name] for name in ("command", "commit", "device")} | {"from_iteration": done}
         config |= {"settings": as_settings(cfg), "iterations": cfg.iterations}
@@ -198,7 +188,6 @@ class RunDirectory:
 
     def save(self, cfg: SearchCfg, scheduler: Any, metrics: Metrics, archive: Archive) -> None:
         """Saves an iteration; killed anywhere in here, the run is either before or after it."""
-        # By the settings a checkpoint that strayed here is noticed.
         state = {"settings": as_settings(cfg), "metrics": metrics, "scheduler": scheduler}
         save_checkpoint(self.path / CHECKPOINT_FILE, state)
         self.write_derived(metrics, archive)
@@ -210,11 +199,7 @@ class RunDirectory:
         write_archive(self.path, archive)
 
     def load(self, cfg: SearchCfg) -> tuple[Any, Metrics]:
-        """Scheduler and metrics of the search that is to go on, as its checkpoint has them.
-
-        (None, []) if there is no run yet, or it was killed before its first checkpoint. A run of other settings, or
-        something else in the directory, is a ValueError.
-        """
+        """Scheduler and metrics of the search to go on with, (None, []) without a checkpoint; refuses another one."""
         if not self.exists():
             if not all(map(is_leftover, self.path.iterdir())):
                 raise ValueError(f"{self.path} is not empty and holds no run: give another --run-dir")
@@ -229,15 +214,17 @@ class RunDirectory:
         settings, metrics, scheduler = (state.get(name) for name in ("settings", "metrics", "scheduler"))
         if not isinstance(settings, dict) or not isinstance(metrics, list) or scheduler is None:
             raise ValueError(f"{file} must have settings, metrics and a scheduler, got {', '.join(state)}; {REMEDY}")
-        _refuse_differences(file, settings, cfg)
-        if len(metrics) > cfg.iterations:
-            done = f"{len(metrics)}, as many as {self.path} has done"
-            raise ValueError(f"iterations must be at least {done}, got {cfg.iterations}")
+        self.check_settings(cfg, settings, file)
+        if (done := len(metrics)) > (wanted := cfg.iterations):
+            raise ValueError(f"iterations must be at least {done}, as many as {self.path} has done, got {wanted}")
         return scheduler, metrics
 
-    def check_settings(self, cfg: SearchCfg) -> None:
-        """Refuses the run of another search."""
-        _refuse_differences(self.path, as_settings(self.read_cfg()), cfg)
+    def check_settings(self, cfg: SearchCfg, stored: dict[str, Any] | None = None, file: Path | None = None) -> None:
+        """Refuses the run of another search, by the settings that a ``file`` stored, or by its config."""
+        stored = as_settings(self.read_cfg()) if stored is None else stored
+        if different := differences(stored, as_settings(cfg)):
+            text = f"{file or self.path} is of other settings: {', '.join(different)}"
+            raise ValueError(f"{text}: start a new run for those")
 
     def read_summary(self) -> dict[str, Any]:
         """The run in numbers; nothing where they were not written or are damaged, as they are made again."""
@@ -256,8 +243,3 @@ class RunDirectory:
         if not rows or not all(isinstance(row, dict) for row in rows):
             raise ValueError(f"{file} must have a row an iteration, got {len(rows)}; {REMEDY}")
         return rows
-
-
-def _refuse_differences(file: Path, settings: dict[str, Any], cfg: SearchCfg) -> None:
-    if different := differences(settings, as_settings(cfg)):
-        raise ValueError(f"{file} is of other settings: {', '.join(different)}: start a new run for those")

@@ -146,19 +146,15 @@ def evaluate_rollout(result: RolloutResult, cells: Cells, cfg: FitnessCfg) -> Ev
     invalid = np.asarray(result.invalid, dtype=bool) | ~np.isfinite(penalties).all(axis=2)
     counted = ~invalid
     mean = _mean(penalties, counted)
+    std = np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted))
+    flags = (result.base_collision, result.reached_goal, result.fallen)
+    collision_rate, goal_rate, fallen_rate = (_mean(flag, counted) for flag in flags)
     return _with_fitness(
-        cells,
-        cfg,
-        ratios=terrain_ratios(penalties, counted),
-        penalty_mean=mean,
-        penalty_std=np.sqrt(_mean((penalties - mean[:, None]) ** 2, counted)),
-        collision_rate=_mean(result.base_collision, counted),
-        goal_rate=_mean(result.reached_goal, counted),
-        fallen_rate=_mean(result.fallen, counted),
-        end_position=typical_ends(result, counted),
-        invalid_episodes=invalid.sum(axis=1),
+        cells, cfg, ratios=terrain_ratios(penalties, counted), penalty_mean=mean, penalty_std=std,
+        collision_rate=collision_rate, goal_rate=goal_rate, fallen_rate=fallen_rate,
+        end_position=typical_ends(result, counted), invalid_episodes=invalid.sum(axis=1),
         episodes=np.full(len(invalid), invalid.shape[1]),
-    )
+    )  # fmt: skip
 
 
 def merge_evaluations(first: Evaluation, second: Evaluation, cells: Cells, cfg: FitnessCfg) -> Evaluation:
@@ -170,15 +166,11 @@ def merge_evaluations(first: Evaluation, second: Evaluation, cells: Cells, cfg: 
         return (1.0 - shares) * before + shares * after
 
     between = (share * (1.0 - share))[:, None] * (first.penalty_mean - second.penalty_mean) ** 2
-    return _with_fitness(
-        cells,
-        cfg,
-        **{name: weigh(getattr(first, name), getattr(second, name)) for name in _MEANS},
-        penalty_std=np.sqrt(weigh(first.penalty_std**2, second.penalty_std**2) + between),
-        end_position=np.where(np.isfinite(second.end_position), second.end_position, first.end_position),
-        invalid_episodes=first.invalid_episodes + second.invalid_episodes,
-        episodes=first.episodes + second.episodes,
-    )
+    means = {name: weigh(getattr(first, name), getattr(second, name)) for name in _MEANS}
+    std = np.sqrt(weigh(first.penalty_std**2, second.penalty_std**2) + between)
+    ends = np.where(np.isfinite(second.end_position), second.end_position, first.end_position)
+    sums = {name: getattr(first, name) + getattr(second, name) for name in ("invalid_episodes", "episodes")}
+    return _with_fitness(cells, cfg, penalty_std=std, end_position=ends, **means, **sums)
 
 
 def _with_fitness(cells: Cells, cfg: FitnessCfg, **statistics: NDArray[Any]) -> Evaluation:
@@ -198,8 +190,7 @@ def find_worth(fitness: Any, share: Any) -> Any:
 def typical_ends(result: RolloutResult, counted: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Where the typical episode of each terrain ended: the median, by coordinate, over episodes of its typical outcome.
 
-    That is the goal where at least half reach it, else the commonest other outcome. ``counted`` says which episodes
-    count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
+    ``counted`` says which episodes count, shape (T, R). World-local x and y [m], shape (T, 2); NaN where none does.
     """
     outcome = np.where(counted, result.outcome, Outcome.INVALID)
     alike = counted & (outcome == typical_outcome(outcome)[:, None])

@@ -2,7 +2,6 @@
 
 import time
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -54,11 +53,7 @@ def start_search(
     skip_level_ground: bool = False,
     likely: Path | None = None,
 ) -> tuple[SearchCfg, RobotCfg]:
-    """Settings of a new search by the name of a preset, and its robot, which is checked and has penalty scales then.
-
-    Robot, controller, space and the file ``likely`` are as flags take them. ``height`` is the largest one of a bump
-    [m]; None is that which fits the robot. A user's robot must cross level ground, unless ``skip_level_ground``.
-    """
+    """Settings of a new search, by a preset's name and flags, and its robot, checked and with penalty scales."""
     terrain_space = load_space(space)
     if height is not None:
         terrain_space = at_height(terrain_space, height)
@@ -68,8 +63,8 @@ def start_search(
     terrain_space = space_at(terrain_space, height, ready)
     if terrain_space.asks == Kind.ROUTE:
         ensure_stray(ready, policy, compute)
-    named: Any = {"space": terrain_space.name, "space_sha256": terrain_space.sha256}
-    return preset(size, ready, policy, likely=likely, **named), ready
+    name, sha256 = terrain_space.name, terrain_space.sha256
+    return preset(size, ready, policy, space=name, space_sha256=sha256, likely=likely), ready
 
 
 def search(
@@ -84,9 +79,8 @@ def search(
     """Searches, or goes on with the search in the run directory ``path``, until it has done its iterations.
 
     It ends earlier once its last tenth brought a share of the elites below ``until``
-    (:func:`qd.search.results.compute_last_tenth`), crosses what it asked for, and settles. Nothing is written before
-    the simulation is built. ``robot`` is given if it is not shipped, ``policy`` if the controller lies elsewhere than
-    ``cfg`` says. The archive is a judged one if nothing was left to do after it.
+    (:func:`qd.search.results.compute_last_tenth`). ``robot`` is given if it is not shipped, ``policy`` if the
+    controller lies elsewhere than ``cfg`` says. The archive is a judged one if nothing was left to do after it.
     """
     robot = robot or get_robot(cfg.robot)
     if unknown := set(cfg.fitness.penalties) - set(robot.penalties):
@@ -97,27 +91,27 @@ def search(
     space = cfg.terrain_space
     run = RunDirectory(path)
     crossing = PipelineCfg(
-        compute=compute,
-        robot=robot,
-        policy=policy,
-        num_terrains=cfg.scheduler.num_terrains,
-        replicas=cfg.replicas,
-        lots=cfg.scheduler.num_groups,
-        space=space.name,  # where its code is now
-    )
+        compute=compute, robot=robot, policy=policy, num_terrains=cfg.scheduler.num_terrains, replicas=cfg.replicas,
+        lots=cfg.scheduler.num_groups, space=space.name,  # where its code is now
+    )  # fmt: skip
     with claimed(path):
         archive = read_finished(run, cfg, until)
         scheduler: Any
         scheduler, metrics = run.load(cfg) if archive is None else (None, run.read_metrics())
         done = len(metrics)
         last = find_last_iteration(cfg, metrics, until)
-        say(_describe_search(replace(cfg, iterations=last), path, done, compute.device, crossing.num_workers))
+        controller = "its own controller" if cfg.policy == SHIPPED else cfg.policy
+        say(
+            f"{path}: {last - done:,} of {last:,} iterations to go, each of {cfg.scheduler.num_terrains} terrains x "
+            f"{cfg.replicas} episodes of {cfg.robot} with {controller} on {cfg.space}; in all "
+            f"{(last - done) * cfg.episodes_per_iteration:,} episodes by {crossing.num_workers} on {compute.device}; "
+            f"preset {cfg.preset}, seed {cfg.seed}, {cfg.cells.num_cells:,} reachable cells"
+        )
         if note := scaled_by_another(robot, policy):
             print(note)
         if done < last:
-            scheduler = scheduler or Scheduler(
-                cfg.scheduler, space=space, cells=cfg.cells, fitness=cfg.fitness, seed=cfg.seed
-            )
+            how: dict[str, Any] = {"space": space, "cells": cfg.cells, "fitness": cfg.fitness, "seed": cfg.seed}
+            scheduler = scheduler or Scheduler(cfg.scheduler, **how)
             scheduler.compute_on(compute.device)
             labeller = Labeller(cfg, robot, policy, compute, metrics) if cfg.fitness.crossed else None
             try:
@@ -141,24 +135,12 @@ def search(
     return archive
 
 
-def _describe_search(cfg: SearchCfg, path: Path, done: int, device: str, workers: int) -> str:
-    """What a search is about to do after ``done`` iterations, by so many processes or GPUs."""
-    left, controller = cfg.iterations - done, "its own controller" if cfg.policy == SHIPPED else cfg.policy
-    return (
-        f"{path}: {left:,} of {cfg.iterations:,} iterations to go, each of {cfg.scheduler.num_terrains} terrains x "
-        f"{cfg.replicas} episodes of {cfg.robot} with {controller} on {cfg.space}; in all "
-        f"{left * cfg.episodes_per_iteration:,} episodes by {workers} on {device}; preset {cfg.preset}, seed "
-        f"{cfg.seed}, {cfg.cells.num_cells:,} reachable cells"
-    )
-
-
 def _run_iterations(
     cfg: SearchCfg, run: RunDirectory, scheduler: Scheduler, metrics: Metrics, pipeline: Pipeline,
     labeller: Labeller | None, bar: Bar, until: float | None,
 ) -> None:  # fmt: skip
     """Runs the iterations that are left in a fixed order, so that a search that goes on is one that never stopped."""
-    space = cfg.terrain_space
-    num_groups = cfg.scheduler.num_groups
+    space, num_groups = cfg.terrain_space, cfg.scheduler.num_groups
     last = find_last_iteration(cfg, metrics, until)
 
     def ask(group: int, iteration: int) -> NDArray[np.float32]:

@@ -121,11 +121,11 @@ class UniformRandom(Method):
         """Random genes."""
         from sim.terrains.spaces.registry import get_space
 
-        space = get_space(*self._space)
-        return np.concatenate([self._draw(space, self.sources[emitter]) for emitter in emitters])
+        draw = self._draw(get_space(*self._space))
+        return np.concatenate([draw(self.batch_size, self.sources[emitter]) for emitter in emitters])
 
-    def _draw(self, space: "TerrainSpace", rng: np.random.Generator) -> NDArray[np.float32]:
-        return space.uniform_random(self.batch_size, rng)
+    def _draw(self, space: "TerrainSpace") -> Callable[..., NDArray[np.float32]]:
+        return space.uniform_random
 
 
 class HardRandom(UniformRandom):
@@ -133,8 +133,8 @@ class HardRandom(UniformRandom):
 
     text = "the paper's random terrains, every height at its limit, which learn nothing"
 
-    def _draw(self, space: "TerrainSpace", rng: np.random.Generator) -> NDArray[np.float32]:
-        return space.hard_random(self.batch_size, rng)
+    def _draw(self, space: "TerrainSpace") -> Callable[..., NDArray[np.float32]]:
+        return space.hard_random
 
 
 @dataclass(frozen=True, kw_only=True)

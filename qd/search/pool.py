@@ -1,7 +1,7 @@
-"""Which terrain holds a cell when evaluations are noisy.
+"""Which terrain holds a cell when evaluations are noisy: not the one of the best draw, which would be the luckiest.
 
-A search that keeps the best draw keeps the luckiest. Here a few terrains a cell are crossed again, and it is held by
-the one that should add most to the QD score of fresh episodes (Flageat and Cully 2023, "Uncertain Quality-Diversity").
+A few terrains a cell are crossed again, and it is held by the one that should add most to the QD score of fresh
+episodes (Flageat and Cully 2023, "Uncertain Quality-Diversity").
 """
 
 import numpy as np
@@ -10,14 +10,7 @@ from scipy.special import ndtr
 
 from qd.faults.numbers import FRESH_EPISODES
 from qd.search.descriptors import Cells
-from qd.search.fitness import (
-    BIT_EPISODES,
-    FITNESS_FLOOR,
-    Evaluation,
-    FitnessCfg,
-    join_evaluations,
-    merge_evaluations,
-)
+from qd.search.fitness import BIT_EPISODES, FITNESS_FLOOR, Evaluation, FitnessCfg, join_evaluations, merge_evaluations
 
 DEPTH = 3
 """Terrains that each cell has at most."""
@@ -89,8 +82,7 @@ class Pool:
     ) -> Evaluation:
         """Takes in what crossings of T terrains showed, and returns what is known of these now.
 
-        Solutions are unclipped genes, shape (T, num_genes); ``number`` is -1 of new terrains, and of those that were
-        crossed again, perhaps several times, theirs, shape (T,). Iterations are numbered from 1.
+        Solutions are unclipped genes, (T, num_genes); ``number`` is -1 of new ones, else theirs, even repeated, (T,).
         """
         merged = crossed.rows(np.arange(len(number)))
         new, again = np.flatnonzero(number < 0), np.flatnonzero(number >= 0)
@@ -103,15 +95,14 @@ class Pool:
             for name, values in vars(merge_evaluations(before, after, self.cells, self.fitness)).items():
                 getattr(self.terrains, name)[rows] = getattr(merged, name)[chosen] = values
             self._crossings[rows] += 1
-        first = crossed.rows(new)
+        first, count = crossed.rows(new), len(new)
         self.terrains = first if self.terrains is None else join_evaluations([self.terrains, first])
-        self.solutions = np.concatenate([self.solutions, solutions[new]])
-        self.iteration = np.append(self.iteration, np.full(len(new), iteration))
-        self.number = np.append(self.number, self._next_number + np.arange(len(new)))
-        self._crossings = np.append(self._crossings, np.ones(len(new), np.int64))
-        self._next_number += len(new)
-        self.share = np.append(self.share, np.ones(len(new)))
-        self.holds, self.labelled = (np.append(each, np.zeros(len(new), bool)) for each in (self.holds, self.labelled))
+        columns = {"solutions": solutions[new], "iteration": np.full(count, iteration)}
+        columns |= {"number": self._next_number + np.arange(count), "_crossings": np.ones(count, np.int64)}
+        columns |= {"share": np.ones(count), "holds": np.zeros(count, bool), "labelled": np.zeros(count, bool)}
+        for name, values in columns.items():
+            setattr(self, name, np.concatenate([getattr(self, name), values]))
+        self._next_number += count
         return merged
 
     def least_known(self, count: int, pending: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -25,6 +25,7 @@ from sim.files.templates import open_templates
 from sim.robots.find import resolve_robot
 from sim.rollout import RolloutResult
 
+_BATCH = ("fitness", "collision_rate", "goal_rate")
 UNTIL_FROM = 20
 """Iterations that must have crossed anything new before a search is judged by the last tenth of them."""
 _FRESH_NUMBERS = (
@@ -39,14 +40,8 @@ _TEMPLATES.filters["escape_markup"] = escape
 def build_archive(cfg: SearchCfg, scheduler: Scheduler, iterations: int) -> Archive:
     """What a search has found after a number of iterations."""
     elites: dict[str, Any] = scheduler.elites()
-    return Archive(
-        **vars(select_settings(Subject, cfg)),
-        penalties=cfg.fitness.penalties,
-        scales=cfg.fitness.scales,
-        iterations=iterations,
-        **elites,
-        **no_outcomes(len(elites["cell"])),
-    )
+    elites |= no_outcomes(len(elites["cell"])) | vars(select_settings(Subject, cfg))
+    return Archive(penalties=cfg.fitness.penalties, scales=cfg.fitness.scales, iterations=iterations, **elites)
 
 
 def describe_metrics(archive: Archive, result: RolloutResult, evaluation: Evaluation) -> dict[str, Any]:
@@ -59,9 +54,7 @@ def describe_metrics(archive: Archive, result: RolloutResult, evaluation: Evalua
         "episodes": int(evaluation.episodes.sum()),
         "invalid_episodes": int(evaluation.invalid_episodes.sum()),
         "invalid_terrains": int((~evaluation.valid).sum()),
-        "batch_fitness": float(evaluation.fitness.mean()),
-        "batch_collision_rate": float(evaluation.collision_rate.mean()),
-        "batch_goal_rate": float(evaluation.goal_rate.mean()),
+        **{f"batch_{name}": float(getattr(evaluation, name).mean()) for name in _BATCH},
         "invalid_reasons": invalid_reasons(result),
         "physics_steps": int(result.physics_steps),
         "robot_steps": int(result.robot_steps),
@@ -72,10 +65,7 @@ def describe_metrics(archive: Archive, result: RolloutResult, evaluation: Evalua
 
 
 def find_last_iteration(cfg: SearchCfg, metrics: Metrics, until: float | None) -> int:
-    """The iteration that ends a search, by the metrics alone: so a search that goes on ends where it would have.
-
-    After the one whose last tenth brought too little, robots cross what it asked for, and then all settles.
-    """
+    """The iteration that ends a search, by its metrics alone: after a last tenth of too little, all settles."""
     shares = {row["iteration"]: row["last_tenth"] for row in metrics if row["last_tenth"] is not None}
     ends = [number + 1 + cfg.scheduler.settling for number, share in shares.items() if share < (until or 0.0)]
     return min([cfg.iterations, *(end for end in ends if end >= len(metrics))])
@@ -114,8 +104,7 @@ def write_results(run: RunDirectory, archive: Archive, metrics: Metrics) -> None
     numbers = {
         **origin,
         **archive.named(),
-        "space": archive.space,
-        "space_sha256": archive.space_sha256,
+        **{name: getattr(archive, name) for name in ("space", "space_sha256")},
         **found_numbers(archive, metrics),
         **dict.fromkeys(_FRESH_NUMBERS),
         **fault_numbers(archive),
@@ -144,10 +133,7 @@ def print_summary(
     space: str | None = None,
     skip_level_ground: bool = False,
 ) -> None:
-    """Prints what a run's archive says of the controller; nothing without elites.
-
-    Robot, controller, space and what was skipped are as the command line names them, if it does.
-    """
+    """Prints what a run's archive says of the controller, by flags of its command; nothing without elites."""
     if not len(archive):
         return
     half_width = resolve_robot(archive.named(), robot, run).half_width
@@ -158,17 +144,13 @@ def print_summary(
     flags = {"run": run, "robot": robot, "space": space}
     judge = {**flags, "policy": policy, "skip_level_ground": skip_level_ground}
     text = _TEMPLATES.get_template("summary.txt").render(
-        archive=archive,
-        ranking=ranking,
-        summary=summarise_search(ranking, archive),
-        number=number,
+        archive=archive, ranking=ranking, summary=summarise_search(ranking, archive), number=number,
         name=ranking.name(ranking.find_row(number)),
         view=command_line("view", **flags, policies=[f"searched={policy}"] if policy else []),
         report=command_line("report", **flags, policy=policy),
         replay=command_line("replay", **flags, elite=number, policy=policy),
-        judge=command_line("judge", **judge),
-        steered=command_line("judge", **judge, stages="steered"),
+        judge=command_line("judge", **judge), steered=command_line("judge", **judge, stages="steered"),
         finetune=command_line("finetune", robot=robot, specialist=run, policy=policy, space=space),
-    )
+    )  # fmt: skip
     console = Console(highlight=False)
     console.print(text.rstrip(), soft_wrap=not console.is_terminal)

@@ -1,7 +1,7 @@
 """The state of a Quality-Diversity search: methods that ask for terrains, and the pyribs archive of the best ones.
 
-The reachable cells are numbered, so an archive has one dimension with one unit a cell, and a terrain's measure is the
-middle of its cell. It holds unclipped solutions, for evolution strategies, and the clipped genes as data.
+An archive has one dimension, whose units are the reachable cells; a terrain's measure is the middle of its cell. It
+holds unclipped solutions, for evolution strategies, and the clipped genes as data.
 """
 
 from functools import partial
@@ -41,11 +41,7 @@ class Asked(NamedTuple):
 
 
 class Scheduler:
-    """The state of a search, which a checkpoint holds: ask for genes, tell what became of them.
-
-    Emitters take the methods in turn. Groups of emitters ask and are told one after the other. Where terrains are
-    crossed again, the archive has those that hold the cells of a pool.
-    """
+    """The state of a search, which a checkpoint holds: ask for genes, tell what became of them; methods take turns."""
 
     def __init__(
         self, cfg: SchedulerCfg, *, cells: Cells, fitness: FitnessCfg, seed: int, space: TerrainSpace = SUPER_GAUSSIAN
@@ -107,14 +103,11 @@ class Scheduler:
 
     def _pending_numbers(self) -> NDArray[np.int64]:
         """Numbers of the terrains that robots are to cross again already."""
-        numbers = [asked.number[asked.number >= 0] for asked in self._asked if asked]
-        return np.concatenate([np.zeros(0, np.int64), *numbers])
+        numbers = np.concatenate([np.zeros(0, np.int64), *(asked.number for asked in self._asked if asked)])
+        return numbers[numbers >= 0]
 
     def tell(self, evaluation: Evaluation, iteration: int, group: int = 0) -> int:
-        """Tells a group of emitters what became of the terrains that it last asked for, one row each in that order.
-
-        Iterations are numbered from 1. Returns how many of the terrains were new.
-        """
+        """Tells a group of emitters what became of the terrains that it last asked for; returns how many were new."""
         asked = self._asked[group]
         assert asked is not None
         self._asked[group] = None
@@ -126,16 +119,15 @@ class Scheduler:
         if accepted.any():
             for name, values in self._archive.add(**{name: column[accepted] for name, column in rows.items()}).items():
                 added[name][accepted] = values
-        if self._pool is not None and self._pool.terrains is not None:
+        if (pool := self._pool) is not None and pool.terrains is not None:
             if (surrogate := self._surrogate) is not None:
-                genes = clipped(self._pool.solutions)
-                chance = surrogate.find_chance(genes, self._pool.terrains.goal_rate)
-                self._pool.share = surrogate.find_share(genes, chance)
-            held = self._pool.settle(self._pending_numbers())  # the archive is made anew, of those that hold the cells
+                genes = clipped(pool.solutions)
+                pool.share = surrogate.find_share(genes, surrogate.find_chance(genes, pool.terrains.goal_rate))
+            held = pool.settle(self._pending_numbers())  # the archive is made anew, of those that hold the cells
             self._archive.clear()
             if len(held):
-                terrains = self._pool.terrains.rows(held)
-                self._archive.add(**_archive_rows(self._pool.solutions[held], terrains, self._pool.iteration[held]))
+                rows_held = _archive_rows(pool.solutions[held], pool.terrains.rows(held), pool.iteration[held])
+                self._archive.add(**rows_held)
         num_new = len(asked.new)
         emitters = self._group_emitters(group) if num_new else range(0)
         size = num_new // max(1, len(emitters))
@@ -153,7 +145,7 @@ class Scheduler:
     def ask_crossed(
         self, most: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
-        """Failing elites of which is to be found out whether anybody crosses them, at most so many, drawn at random.
+        """Failing elites that nobody has tried to cross, at most so many, drawn at random.
 
         Rows for :meth:`tell_crossed`, (T,), clipped genes, (T, num_genes), and goal rates, (T,).
         """
@@ -179,19 +171,13 @@ class Scheduler:
 
 
 def _make_archive(num_genes: int, cells: Cells, stream: np.random.SeedSequence, **learning: Any) -> GridArchive:
-    """An empty archive; ``learning`` are pyribs' ``learning_rate`` and ``threshold_min``."""
     extra_fields: dict[str, Any] = {"genes": ((num_genes,), np.float32), "end_position": ((2,), np.float32)}
     extra_fields |= dict.fromkeys(_STATISTICS, ((cells.num_ratios,), np.float64))
     extra_fields |= dict.fromkeys(_RATES, ((), np.float64)) | dict.fromkeys(_COUNTS, ((), np.int64))
-    return GridArchive(
-        solution_dim=num_genes,
-        dims=[cells.num_cells],
-        ranges=[(0, cells.num_cells)],
-        seed=stream,  # pyright: ignore[reportArgumentType] - handed to numpy's default_rng, which takes it
-        solution_dtype=np.float32,
-        extra_fields=extra_fields,
-        **learning,
-    )
+    fields: dict[str, Any] = {"solution_dtype": np.float32, "extra_fields": extra_fields}
+    fields["seed"] = stream  # handed to NumPy's default_rng, which takes it
+    count = cells.num_cells
+    return GridArchive(solution_dim=num_genes, dims=[count], ranges=[(0, count)], **fields, **learning)
 
 
 def _archive_rows(solutions: NDArray[np.float32], terrains: Evaluation, iteration: NDArray[np.int64] | int) -> Columns:

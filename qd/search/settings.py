@@ -66,18 +66,13 @@ def preset(
 ) -> SearchCfg:
     """Settings of a search by the name of a preset; ``policy`` and ``likely`` are shipped ones if None."""
     known = choose_likely(get_space(space, space_sha256), likely)
+    scales, named = read_penalty_scales(robot, policy), policy or SHIPPED
     return SearchCfg(
-        robot=robot.name,
-        **robot_identity(robot),
-        preset=name,
-        policy=policy or SHIPPED,
-        policy_sha256=controller_hash(resolve_policy(policy or SHIPPED, robot)),
-        space=space,
-        space_sha256=space_sha256,
-        collision_bit=robot.collision_bit,
-        fitness=FitnessCfg(penalties=robot.penalties, scales=read_penalty_scales(robot, policy), disturbances=known),
-        **read_preset(name),
-    )
+        robot=robot.name, **robot_identity(robot), preset=name, policy=named,
+        policy_sha256=controller_hash(resolve_policy(named, robot)), space=space, space_sha256=space_sha256,
+        collision_bit=robot.collision_bit, **read_preset(name),
+        fitness=FitnessCfg(penalties=robot.penalties, scales=scales, disturbances=known),
+    )  # fmt: skip
 
 
 def as_settings(cfg: SearchCfg) -> dict[str, Any]:
@@ -109,10 +104,7 @@ def is_searched(cfg: SearchCfg, policy: str, robot: RobotCfg) -> bool:
 
 
 def find_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:
-    """The controller that a run was searched with, which must be what it was.
-
-    Code runs only if the command line names it, so a controller that is code is refused here.
-    """
+    """The controller that a run was searched with, which must be what it was, and no code."""
     if ControllerSpec.parse(cfg.policy).runs_code:
         remedy = f"name it again (--policy {shlex.quote(cfg.policy)})"
         reason = "since no code runs that the command line does not name"
@@ -120,8 +112,7 @@ def find_policy(path: Path, cfg: SearchCfg, robot: RobotCfg) -> str:
     policy = resolve_policy(cfg.policy, robot)
     if not is_searched(cfg, policy, robot):
         digest = controller_hash(policy)
-        state = "lost" if digest is None else "another one now"
-        hashes = f"(expected SHA-256 {cfg.policy_sha256}, got {digest})"
+        state = f"{'another one now' if digest else 'lost'} (expected SHA-256 {cfg.policy_sha256}, got {digest})"
         remedy = "put it back, or say with --policy where it is"
-        raise ValueError(f"{path} was searched with the controller in {policy}, which is {state} {hashes}: {remedy}")
+        raise ValueError(f"{path} was searched with the controller in {policy}, which is {state}: {remedy}")
     return policy

@@ -1,8 +1,4 @@
-"""Crossings and recordings on disk: arrays by key, in a folder of bounded size.
-
-A terrain's episodes depend on the terrain, its seed and the settings of the crossing alone. So each lot is stored when
-it is done, with a key for every terrain, and a terrain is read again in whatever lots.
-"""
+"""Crossings and recordings on disk: arrays by key, in a folder of bounded size."""
 
 import hashlib
 import os
@@ -26,10 +22,7 @@ _ROWS = "rows"
 
 
 class Cache:
-    """Arrays in the files of a folder, by key. A damaged file counts as absent, in a printed line.
-
-    The time of a file says when it was used last: above ``max_bytes`` the least recently used ones are removed.
-    """
+    """Arrays in the files of a folder, by key; the least recently used are removed, a damaged one counts as absent."""
 
     def __init__(self, folder: Path, *, max_bytes: int = MAX_BYTES) -> None:
         self.folder = folder
@@ -88,12 +81,10 @@ class Cache:
 
 
 class StoredCrossings:
-    """Crossings in a cache by the digest of terrain and seed; ``settings`` is the hash of all else they depend on."""
+    """Lots in a cache, by digests of terrains and seeds; ``settings`` hashes all else that episodes depend on."""
 
     def __init__(self, cache: Cache, settings: str, penalty_names: tuple[str, ...]) -> None:
-        self._cache = cache
-        self._settings = settings
-        self._penalty_names = penalty_names
+        self._cache, self._settings, self._penalty_names = cache, settings, penalty_names
         self._index: dict[bytes, tuple[str, int]] = {}  # of a terrain, the file's key and the row there
         for key in cache.keys(settings):  # not those that other processes write later
             if stored := cache.read(key, [_ROWS]):

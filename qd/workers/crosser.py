@@ -1,13 +1,10 @@
-"""The crossing service: controllers cross terrains, in lots that fill the device, and what is done is kept on disk.
-
-A command that was stopped goes on when it is run again, with the crossings in the cache (:mod:`qd.workers.cache`).
-"""
+"""The crossing service: controllers cross terrains, in lots that fill the device, and what is done is kept on disk."""
 
 import hashlib
 import importlib
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -94,9 +91,8 @@ class Crosser(ExitStack):
         Penalties are summed from ``penalties_from_s`` of an episode on [s], with ``reward`` the training task's reward
         too; with ``record`` the result has frames. It is not stored then, nor where episodes are steered. The progress
         bar shows ``label``, or ``progress`` gets the share that is done. ``room`` are the terrains of the largest call
-        to come that agrees with this one. Many invalid episodes are reported on stderr; a result without a valid one is
-        returned if ``invalid_ok``. Steps and time are those of terrains that were not in the cache. MuJoCo C does not
-        say why an episode is invalid.
+        to come that agrees with this one. A result without a valid episode is returned if ``invalid_ok``. Steps and
+        time are those of terrains that were not in the cache.
         """
         if replicas < 1 or engine not in get_args(Engine):
             rule = f"replicas must be 1 or more, engine one of {get_args(Engine)}"
@@ -142,12 +138,11 @@ class Crosser(ExitStack):
         controller = controller_hash(cfg.policy)
         if self._cache is None or controller is None:
             return None
-        settings = [robot_identity(self.robot), self.robot.penalties, controller]
-        settings += [space_key(terrains.space.name, terrains.space.sha256)]
-        settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s]
-        terms = repr(self.robot.training) if cfg.reward else None  # that the reward has
-        settings += [terms, code_fingerprint(("kernels", "sim"))]
-        settings += [read_stray(self.robot, resolved=cfg.is_resolved)] if terrains.space.asks == Kind.ROUTE else []
+        space, terms = terrains.space, repr(self.robot.training) if cfg.reward else None  # that the reward has
+        settings = [robot_identity(self.robot), self.robot.penalties, controller, space_key(space.name, space.sha256)]
+        settings += [cfg.replicas, self.compute.on_gpu, cfg.engine, cfg.penalties_from_s, terms]
+        settings += [code_fingerprint(("kernels", "sim"))]
+        settings += [read_stray(self.robot, resolved=cfg.is_resolved)] if space.asks == Kind.ROUTE else []
         key = hashlib.sha256(json.dumps(settings).encode()).hexdigest()[:32]
         if key not in self._stored:
             self._stored[key] = StoredCrossings(self._cache, key, self.robot.penalties)
@@ -165,11 +160,8 @@ class Crosser(ExitStack):
         lot = each * replace(cfg, num_terrains=count).num_workers
         try:
             pipeline = self._open(replace(cfg, num_terrains=min(count, 2 * lot)))
-            if progress is not None:
-                yield from pipeline.in_lots(terrains, lot, progress)
-                return
-            with Bar(label) as bar:
-                yield from pipeline.in_lots(terrains, lot, bar.move_to)
+            with nullcontext() if progress else Bar(label) as bar:
+                yield from pipeline.in_lots(terrains, lot, bar.move_to if bar else progress)
         except BaseException:
             self._opened = None  # what failed is not used again
             self.close()
@@ -182,9 +174,8 @@ class Crosser(ExitStack):
             if replace(opened, num_terrains=cfg.num_terrains) == cfg and opened.num_terrains >= cfg.num_terrains:
                 return pipeline
         self.close()
-        pipeline = self.enter_context(open_pipeline(cfg))
-        self._opened = (cfg, pipeline)
-        return pipeline
+        self._opened = cfg, self.enter_context(open_pipeline(cfg))
+        return self._opened[1]
 
 
 def cross(
@@ -199,10 +190,7 @@ def cross(
     penalties_from_s: float = 0.0,
     cache: Path | None = None,
 ) -> dict[str, RolloutResult]:
-    """Lets each controller cross each terrain: one result a controller, by its name.
-
-    All else is as :meth:`Crosser.cross` takes it; without ``compute`` the CPU crosses, by a process a core.
-    """
+    """Lets each controller cross each terrain, as :meth:`Crosser.cross` does: one result a controller, by its name."""
     with Crosser(robot, compute or Compute(), cache=cache) as crosser:
         return {
             name: crosser.cross(

@@ -41,8 +41,7 @@ def format_reasons(reasons: Mapping[str, int]) -> str:
 
 def explain_invalid(reasons: Mapping[str, int], episodes: int) -> str | None:
     """What to say of invalid episodes by reason, the most frequent first; None where they are 5 % or less."""
-    count = sum(reasons.values())
-    if count <= WARNED_SHARE * episodes:
+    if (count := sum(reasons.values())) <= WARNED_SHARE * episodes:
         return None
     share = f"{count / episodes:.1%}: {format_reasons(reasons)}"
     return f"{count} of {episodes} episodes are invalid and left out ({share}); {_REASONS[next(iter(reasons))][1]}"
@@ -75,13 +74,12 @@ def find_flaw(result: Any, count: int, replicas: int) -> str | None:
     """Why a result cannot be one of ``count`` terrains; None if it can. Memory may go bad on another machine."""
     if not isinstance(result, RolloutResult):
         return f"no result but {type(result).__name__}"
-    shape = (count, replicas)
+    shape, invalid = (count, replicas), result.invalid
     if wrong := [f"{name} of shape {a.shape}" for name, a in result.arrays.items() if a.shape[:2] != shape]:
         return f"{', '.join(wrong)} for {count} terrains of {replicas} episodes"
-    invalid = result.invalid
-    penalties = result.penalties[~invalid]
     if result.penalties.shape != (*shape, len(result.penalty_names)):
         return f"penalties of shape {result.penalties.shape}"
+    penalties = result.penalties[~invalid]
     rewards = np.zeros(0) if result.reward is None else result.reward[~invalid]
     flaws = {
         "valid episodes with penalties that are negative or not finite": (penalties < 0.0) | ~np.isfinite(penalties),

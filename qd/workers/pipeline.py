@@ -42,7 +42,6 @@ class PipelineCfg:
     num_terrains: int
     """Terrains under way at once; of more, half as many follow each time that the first half is done."""
     replicas: int
-    """Episodes a terrain."""
     lots: int = 1
     """Lots of terrains under way at once in a search, equally large."""
     engine: Engine = "search"
@@ -51,7 +50,6 @@ class PipelineCfg:
     with_ground: bool = False
     """Whether heights come with maps of friction and softness."""
     with_conditions: bool = False
-    """Whether heights come with conditions."""
     with_steering: bool = False
     """Whether terrains come with ways of their episodes."""
     penalties_from_s: float = 0.0
@@ -150,24 +148,16 @@ def build_simulator(cfg: PipelineCfg, num_terrains: int) -> Simulator:
     if cfg.helps_to_compile:
         sim.simulation.load_kernels(cfg.compute.device)
     rollout = Rollout(
-        robot,
-        cfg.policy,
-        num_terrains=num_terrains,
-        replicas=cfg.replicas,
-        num_envs=cfg.envs_of_worker,
-        device=cfg.compute.device,
-        cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
-        solver=solver,
-        space=load_space(cfg.space),
-        with_ground=cfg.with_ground,
-        with_conditions=cfg.with_conditions,
+        robot, cfg.policy, num_terrains=num_terrains, replicas=cfg.replicas, num_envs=cfg.envs_of_worker,
+        device=cfg.compute.device, cfg=CrossingCfg(penalties_from_s=cfg.penalties_from_s, reward=cfg.reward),
+        solver=solver, space=load_space(cfg.space), with_ground=cfg.with_ground, with_conditions=cfg.with_conditions,
         with_steering=cfg.with_steering,
-    )
+    )  # fmt: skip
     return RolloutRecorder(rollout) if cfg.record else rollout
 
 
 class Pipeline:
-    """Crosses any number of terrains: lots of them are put in, and come out in the same order.
+    """Crosses lots of terrains, which come out in the order in which they were put in.
 
     Robots go on with the lots behind while the last robots of the first one still walk. At most ``num_terrains`` are
     under way at once. ``simulator`` works in this process; subclasses have others.
@@ -204,13 +194,11 @@ class Pipeline:
     ) -> Iterator[tuple[slice, RolloutResult]]:
         """Crosses each terrain once a replica, in lots of ``size``; drops all pending lots first.
 
-        ``progress`` gets the share of all terrains that is done. Yields which terrains a lot has, and its result; those
-        behind are under way meanwhile as far as there is room.
+        Yields which terrains a lot has, and its result; those behind are under way meanwhile as far as there is room.
         """
-        count = len(terrains)
+        count, num_crossed = len(terrains), 0
         lots = [slice(first, min(first + size, count)) for first in range(0, count, size)]
         behind = deque(lots)
-        num_crossed = 0
 
         def put_what_fits() -> None:
             while behind and (behind[0].stop - num_crossed <= self.num_terrains or behind[0].start == num_crossed):
@@ -241,8 +229,7 @@ class ProcessPipeline(Pipeline):
     def put(self, terrains: Terrains) -> None:
         """Spreads a lot so that over all lots no process gets more than one terrain more than another."""
         each, rest = divmod(len(terrains), len(self._processes))
-        results = dict[int, Any]()
-        begin = 0
+        results, begin = dict[int, Any](), 0
         for index, process in enumerate(self._processes):
             end = begin + each + ((index - self._first) % len(self._processes) < rest)
             if end > begin:

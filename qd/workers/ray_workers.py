@@ -1,7 +1,4 @@
-"""Evaluation by Ray workers, each an actor with one device of a cluster, or of this machine.
-
-Ray places workers and notices when one dies; it cannot know that a result is untrue, or others free meanwhile.
-"""
+"""Evaluation by Ray workers, each an actor with one device of a cluster, or of this machine."""
 
 import socket
 import sys
@@ -97,12 +94,14 @@ class _Shard:
 
 
 class RayWorkers(Pipeline):
-    """Ray workers, one a device of the cluster or as many as asked for; others cross again what a failed one had."""
+    """Ray workers, one a device of the cluster or as many as asked for; others cross again what a failed one had.
+
+    Ray places workers and notices when one dies; it cannot know that a result is untrue, or others free meanwhile.
+    """
 
     def __init__(self, cfg: PipelineCfg, build: Build) -> None:
         super().__init__(cfg.num_terrains)
-        gpus = int(cfg.compute.on_gpu)
-        self._cfg = cfg
+        self._cfg, gpus = cfg, int(cfg.compute.on_gpu)
         _, self._count = parse_workers(cfg.compute.workers)
         self._resources = {"num_gpus": gpus, "num_cpus": 1 - gpus}
         # Controller, robot and space travel once a machine, however many workers it has.
@@ -168,8 +167,7 @@ class RayWorkers(Pipeline):
             progress(1.0)
         self._lots.popleft()
         result = RolloutResult.join([shard.result for shard in lot if shard.result is not None], at_once=True)
-        began = self._result_at
-        self._result_at = time.perf_counter()
+        began, self._result_at = self._result_at, time.perf_counter()
         return replace(result, wall_s=self._result_at - began)
 
     def clear(self) -> None:

@@ -63,8 +63,7 @@ class Start:
 def read_start(path: Path, robot: RobotCfg) -> Start:
     """Networks of an rsl_rl checkpoint or a described controller, for a fine-tuning.
 
-    A normaliser of the observations becomes part of the first layer: (x - mean) / (std + .01) is linear. The critic of
-    such a file is dropped, because it has another normaliser.
+    A normaliser of the observations becomes part of the first layer, which drops the critic, as that has another one.
     """
     if path.name == CHECKPOINT and path.is_file() and DESCRIPTION in (saved := read_checkpoint(path)):
         policy = load_described(read_controller(path, saved[DESCRIPTION]), path, robot, "cpu", path)
@@ -101,8 +100,7 @@ def _make_start(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, p
     count = policy.sizes[1]
     if std is not None and (std.shape != (count,) or not bool(((std > 0.0) & std.isfinite()).all())):
         rule = f"{path}: {STD}, the standard deviation of the actions, must be {count} numbers above 0"
-        got = " ".join(str(std).split())
-        raise ValueError(f"{rule}, got {got}: leave it out, or give another controller")
+        raise ValueError(f"{rule}, got {' '.join(str(std).split())}: leave it out, or give another controller")
     if critic is not None:
         expected = {}
         for k, (width, out) in enumerate(pairwise((robot.observation_size, *hidden, 1))):
@@ -117,10 +115,7 @@ def _make_start(policy: MlpPolicy, actor: State, critic: Any, robot: RobotCfg, p
 
 @torch.inference_mode()
 def plain_layers(network: Any, name: str) -> MlpPolicy:
-    """A network as a perceptron; a TorchScript module must compute the same as its layers.
-
-    Errors call the controller ``name``.
-    """
+    """A network as a perceptron; a TorchScript module, of file ``name``, must compute the same as its layers."""
     if isinstance(network, MlpPolicy):
         return network
     module = getattr(network, "module", None)

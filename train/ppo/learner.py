@@ -9,11 +9,10 @@ import math
 import os
 import time
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.env import VecEnv
-from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 from torch import distributed
 
@@ -76,21 +75,19 @@ class Ranks:
 class CommandVecEnv(VecEnv):
     """rsl_rl's view of a :class:`CommandTask`: one observation group, ``policy``, for actor and critic.
 
-    A described actor has another group, ``actor``, and acts through its description.
-
-    Every returned tensor is a copy: rsl_rl keeps the observation it acted on, and the task overwrites its memory in the
-    next step.
+    A described actor has another group, ``actor``, and acts through its description ``controller``. Every returned
+    tensor is a copy, because the next step overwrites the task's memory.
     """
 
     def __init__(self, task: CommandTask, controller: ControllerCfg | None = None) -> None:
-        """Wrap a task; ``controller`` describes an actor with other observations and actions than the task's."""
         self.task = task
         self.controller = controller
-        self._described = None if controller is None else Described(controller, task.robot, "the controller")
-        self.num_envs = task.num_envs
-        self.num_actions = task.robot.num_joints if self._described is None else self._described.num_actions
-        if self._described is not None:
+        self.num_envs, self.num_actions = task.num_envs, task.robot.num_joints
+        self._described = None
+        if controller is not None:
+            self._described = Described(controller, task.robot, "the controller")
             self._described.use(None, task.observation.device)
+            self.num_actions = self._described.num_actions
         self.max_episode_length = task.max_episode_steps
         self.device = str(task.observation.device)
         self.cfg = asdict(task.cfg)
@@ -105,10 +102,7 @@ class CommandVecEnv(VecEnv):
         self.task.episode_steps.copy_(steps)
 
     def get_observations(self) -> TensorDict:
-        """The present observations, ``policy``: shape (num_envs, observation_size).
-
-        Call it when all episodes begin; :meth:`step` returns those after each step.
-        """
+        """The present observations, ``policy`` of shape (num_envs, observation_size), when all episodes begin."""
         groups = {"policy": self.task.observation.clone()}
         if self._described is not None:
             self._described.reset(self.task.episode_steps == 0)
@@ -116,10 +110,9 @@ class CommandVecEnv(VecEnv):
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Make one control step with ``actions`` (num_envs, num_actions), without host synchronisation.
+        """Makes one control step with ``actions`` (num_envs, num_actions), without host synchronisation.
 
-        Returns observations after it (of the new episode if one ended), rewards (num_envs,), dones (num_envs,) and
-        ``{"time_outs": (num_envs,)}``, the dones that no failure caused.
+        Returns observations, rewards, dones, and ``{"time_outs": ...}``, those dones that no failure caused.
         """
         self.task.step(actions if self._described is None else self._described.act(actions))
         end = self.task.end
@@ -128,28 +121,12 @@ class CommandVecEnv(VecEnv):
         return self.get_observations(), self.task.reward.clone(), end != 0, {"time_outs": cut}
 
 
-class Runner(OnPolicyRunner):
-    """rsl_rl's runner, also for several processes on CPUs."""
-
-    def _configure_multi_gpu(self) -> None:
-        ranks = Ranks.from_environment()
-        if ranks.size == 1 or self.device.startswith("cuda"):
-            super()._configure_multi_gpu()
-            return
-        self.is_distributed, self.gpu_world_size = True, ranks.size
-        self.gpu_local_rank, self.gpu_global_rank = ranks.local_rank, ranks.rank
-        self.cfg["multi_gpu"] = {"global_rank": ranks.rank, "local_rank": ranks.local_rank, "world_size": ranks.size}
-        distributed.init_process_group("gloo")  # rsl_rl chooses NCCL, which CPUs lack
-
-
-@dataclass(frozen=True, kw_only=True)
-class Iteration:
-    """Durations and losses of one iteration."""
+class Iteration(NamedTuple):
+    """Durations of one iteration, and its mean value, surrogate and entropy losses."""
 
     collection_s: float
     learning_s: float
     losses: dict[str, float]
-    """Mean value, surrogate and entropy losses."""
 
 
 class Learner:
@@ -163,23 +140,23 @@ class Learner:
     """
 
     def __init__(self, env: CommandVecEnv, cfg: PpoCfg, *, seed: int, random_ages: bool = True) -> None:
-        """Draw the networks from ``seed``, and later the actions.
-
-        With ``random_ages`` the first episodes begin at random ages, so that they do not end together; they are shorter
-        than others.
-        """
+        """Draws networks and actions from ``seed``; ``random_ages`` keep the first episodes from ending together."""
         torch.manual_seed(seed)
-        self.env = env
-        self.cfg = cfg
-        self._random_ages = random_ages
-        self.iteration = 0
-        self.averaged = 0
+        self.env, self.cfg, self._random_ages = env, cfg, random_ages
+        self.iteration = self.averaged = 0
         self._mean: State = {}
         self.ranks = Ranks.from_environment()
         self.steps_per_iteration = env.num_envs * cfg.steps_per_env * self.ranks.size
+        settings, device = runner_settings(cfg, env.controller), str(env.device)
+        if self.ranks.size > 1:
+            on_cuda = device.startswith("cuda")
+            distributed.init_process_group("nccl" if on_cuda else "gloo")
+            if on_cuda:
+                torch.cuda.set_device(self.ranks.local_rank)
+            settings["multi_gpu"] = {"global_rank": self.ranks.rank, "world_size": self.ranks.size}
         with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
-            self.runner = Runner(env, runner_settings(cfg, env.controller), log_dir=None, device=str(env.device))
-        self.alg: CapturedPPO = self.runner.alg  # pyright: ignore[reportAttributeAccessIssue] - as its settings say
+            alg: Any = CapturedPPO.construct_algorithm(env.get_observations(), env, settings, device)
+        self.alg: CapturedPPO = alg
         if self.ranks.size > 1:
             self.alg.broadcast_parameters()
             self._draw_apart(seed)
@@ -190,17 +167,14 @@ class Learner:
         torch.manual_seed((seed + 1) * 1_000_003 + self.iteration * 1009 + self.ranks.rank)
 
     def begin(self) -> None:
-        """Start from an environment whose episodes have all just begun."""
+        """Starts from an environment whose episodes have all just begun."""
         if self._random_ages:
             ages = torch.randint(0, int(self.env.max_episode_length), (self.env.num_envs,), device=self.env.device)
             self.env.episode_length_buf = ages
         self._observations = self.env.get_observations()
 
     def iterate(self) -> Iteration:
-        """Collect ``steps_per_env`` control steps of every environment, then update the networks.
-
-        After a FloatingPointError the networks are unusable; the last checkpoint is intact.
-        """
+        """Collects ``steps_per_env`` control steps of every environment, then updates the networks."""
         alg = self.alg
         began = time.perf_counter()
         alg.train_mode()
@@ -220,7 +194,7 @@ class Learner:
             got = f"losses {losses} or weights that are not: begin again with a lower --ppo.learning-rate"
             raise FloatingPointError(f"iteration {self.iteration}: losses and weights must be finite, got {got}")
         self.iteration += 1
-        return Iteration(collection_s=collected - began, learning_s=time.perf_counter() - collected, losses=losses)
+        return Iteration(collected - began, time.perf_counter() - collected, losses)
 
     def actor_state(self) -> State:
         """The actor under rsl_rl's keys, on the CPU."""

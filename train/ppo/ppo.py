@@ -15,24 +15,20 @@ _EAGER_STEPS = 3  # optimiser steps before the capture: they allocate its state 
 
 
 def runner_settings(cfg: PpoCfg, controller: ControllerCfg | None = None) -> dict[str, Any]:
-    """Settings for ``OnPolicyRunner``; a new dict each call because rsl_rl writes into the one it is given."""
+    """Settings for rsl_rl, which writes into them: a new dict each call."""
     network = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": False}
     actor = {**network, "activation": "elu" if controller is None else controller.activation}
     noise = {"class_name": "GaussianDistribution", "init_std": cfg.init_noise_std, "std_type": "scalar"}
     return {
         "num_steps_per_env": cfg.steps_per_env,
-        "save_interval": 10**9,
-        "check_for_nan": False,
+        "multi_gpu": None,
         "obs_groups": {"actor": ["policy" if controller is None else "actor"], "critic": ["policy"]},
         "algorithm": {
             "class_name": CapturedPPO,
+            **{name: getattr(cfg, name) for name in ("learning_rate", "desired_kl", "gamma", "lam")},
             "num_learning_epochs": cfg.epochs,
             "num_mini_batches": cfg.mini_batches,
-            "learning_rate": cfg.learning_rate,
-            "desired_kl": cfg.desired_kl,
             "schedule": "adaptive",
-            "gamma": cfg.gamma,
-            "lam": cfg.lam,
             "clip_param": cfg.clip,
             "entropy_coef": cfg.entropy,
             "value_loss_coef": 1.0,
@@ -47,13 +43,11 @@ def runner_settings(cfg: PpoCfg, controller: ControllerCfg | None = None) -> dic
 class CapturedPPO(PPO):
     """rsl_rl's PPO for feed-forward actors, without a host synchronisation inside an update.
 
-    The arithmetic is rsl_rl's own. What differs is where it runs: learning rate and losses stay on the device, so that
-    on CUDA one minibatch step (gather, both networks, backward, clip, Adam) is one graph launch instead of hundreds of
-    launches and five synchronisations. On the CPU the same function runs eagerly.
+    The arithmetic is rsl_rl's own. But learning rate and losses stay on the device, so that on CUDA one minibatch step
+    is one graph launch instead of hundreds of launches and five synchronisations. On the CPU it runs eagerly.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Construct rsl_rl's PPO and move its learning rate to the device."""
         super().__init__(*args, **kwargs)
         on_cuda = torch.device(self.device).type == "cuda"
         self._lr = torch.tensor(float(self.learning_rate), device=self.device)
@@ -69,17 +63,13 @@ class CapturedPPO(PPO):
         self._eager_steps = 0
 
     def let_actor_learn(self, learns: bool) -> None:
-        """Let updates change the actor, or the critic alone at a constant learning rate.
-
-        An untrained critic would mislead a trained actor.
-        """
+        """Lets updates change the actor, or, while an untrained critic would mislead it, the critic alone."""
         self._actor_learns.fill_(float(learns))
 
     def begin_actor(self) -> None:
-        """Reset the optimiser's moments of the actor, and let it learn in small steps at first.
+        """Resets the optimiser's moments of the actor, and lets it learn in small steps at first.
 
-        While the critic learned alone, the actor's gradients were zero. Adam's second moment has counted these zeros,
-        so that its first steps would be three times too large.
+        They have counted zero gradients while the critic learned alone: first steps would be three times too large.
         """
         for parameter in self.actor.parameters():
             for value in self.optimizer.state.get(parameter, {}).values():

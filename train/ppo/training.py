@@ -72,9 +72,8 @@ def stop_request() -> Iterator[threading.Event]:
 def train(robot: RobotCfg, cfg: TrainCfg, run_dir: Path, run: RunCfg = RUN) -> Path:
     """Trains a controller by PPO on legged_gym's rough-terrain task; returns its file, ``<run_dir>/policy.pt``.
 
-    If the directory holds a checkpoint of the same settings, the training goes on. torchrun may start several processes
-    of it, each with its GPU and ``cfg.num_envs`` robots. ``run_dir`` gets checkpoint, controller, record and
-    TensorBoard's file. ``run`` has the device and an export.
+    It goes on where the directory holds a checkpoint of the same settings. torchrun may start several processes of it,
+    each with its GPU and ``cfg.num_envs`` robots. ``run_dir`` gets checkpoint, controller, record and TensorBoard file.
     """
     device = find_device(run.device)
     cfg = cfg.sized(robot, device)
@@ -134,13 +133,12 @@ def read_saved(run_dir: Path, kind: Literal["train", "finetune"], robot: str) ->
 
 def check_resumed(run_dir: Path, saved: dict[str, Any], settings: dict[str, Any]) -> None:
     """Refuses to go on with other settings than a training was begun with, or with fewer iterations than are done."""
-    before = {name: value for name, value in saved["settings"].items() if name not in _FREE}
-    now = {name: value for name, value in settings.items() if name not in _FREE}
+    both = (saved["settings"], settings)
+    before, now = ({name: value for name, value in each.items() if name not in _FREE} for each in both)
     if different := differences(before, now):
         raise ValueError(f"{run_dir} was begun with other settings: {', '.join(different)}: give those")
-    if saved["iter"] > settings["iterations"]:
-        rule = f"iterations must be at least {saved['iter']}, which {run_dir} has done"
-        raise ValueError(f"{rule}, got {settings['iterations']}")
+    if (done := saved["iter"]) > (wanted := settings["iterations"]):
+        raise ValueError(f"iterations must be at least {done}, which {run_dir} has done, got {wanted}")
 
 
 def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
@@ -154,12 +152,9 @@ def is_finished(run_dir: Path, iterations: int, export: Path | None) -> bool:
 
 
 class Training:
-    """A training, of a base controller or, with a mix of terrains, a fine-tuning: its task, learner and progress.
+    """A training, of a base controller or, with a mix of terrains, a fine-tuning.
 
     Attributes:
-        task: Robots on their terrains.
-        learner: Actor, critic and optimiser.
-        progress: Rows printed and recorded.
         critic_iterations: First iterations, in which the critic learns alone.
         averaged_from: The iteration after which actors count into the controller.
     """
@@ -177,15 +172,12 @@ class Training:
         facts: dict[str, Any] | None = None,
         start: Start | None = None,
     ) -> None:
-        """Begin, with the networks of ``start`` if given, or go on from a checkpoint (:func:`read_saved`).
+        """Begins, with the networks of ``start`` if given, or goes on from a checkpoint (:func:`read_saved`).
 
         Without ``mix`` robots walk on the tiles of the curriculum. Checkpoint and record have ``settings``
         (:func:`dump_settings`) under one key and each of ``facts`` under its own.
         """
-        self._cfg = cfg
-        self._run_dir = run_dir
-        self._settings = settings
-        self._mix = mix
+        self._cfg, self._run_dir, self._settings, self._mix = cfg, run_dir, settings, mix
         self._facts = facts or {}
         self.critic_iterations: int = self._facts.get("critic_iterations", 0)
         self.averaged_from = max(round((1.0 - cfg.ppo.average) * cfg.iterations), self.critic_iterations)
@@ -201,8 +193,14 @@ class Training:
         elif start is not None:
             self.learner.start_from(start)
         self._origin = {**provenance(device, cfg.seed), "settings": settings, "processes": ranks.size}
-        progress = saved and saved["progress"]
-        self.progress = TrainingProgress(run_dir, self.learner, cfg.iterations, origin=self._origin, saved=progress)
+        self._progress = saved["progress"] if saved else {"env_steps": 0, "wall_s": 0.0, "pieces": [], "curve": []}
+        self._progress["pieces"].append({**self._origin, "from_iteration": self.learner.iteration})
+        self._began = time.monotonic() - self._progress["wall_s"]
+        self._window: list[Iteration] = []  # iterations since the last row
+        self._events = run_dir / f"events.out.tfevents.{time.time():.0f}.{os.getpid()}"
+        if ranks.is_first:
+            self._write_event(file_version="brain.Event:2")
+            print(_HEADER, flush=True)
 
     def before_iteration(self) -> None:
         """Exchanges a mix's terrains when that is due; lets the actor learn after its critic's first iterations."""
@@ -223,17 +221,14 @@ class Training:
             **self.learner.state(),
             "kind": "train" if self._mix is None else "finetune",
             "settings": self._settings,
-            "progress": self.progress.state(),
+            "progress": self._dump_progress(),
             **({} if controller is None else {DESCRIPTION: format_controller(controller)}),
             **({} if self._mix is None else {"mix": self._mix.state(self.task.counts())}),
             **self._facts,
         }
 
     def run(self, export: Path | None) -> Path:
-        """Iterates until all is done or a stop is requested, and saves; returns the controller's file.
-
-        ``export`` is a further file for the controller.
-        """
+        """Iterates until all is done or a stop is requested, and saves, also to ``export``; returns the controller."""
         learner = self.learner
         ranks = learner.ranks
         if ranks.is_first:
@@ -246,7 +241,10 @@ class Training:
                 self.before_iteration()
                 step = learner.iterate()
                 learner.count_into_mean(learner.iteration > self.averaged_from)
-                self.progress.add(step)
+                self._window.append(step)
+                self._progress["env_steps"] += learner.steps_per_iteration
+                if learner.iteration % max(1, self._cfg.iterations // _ROWS) == 0:
+                    self._finish_row()
                 if time.monotonic() - last_save > SAVE_EVERY_S and ranks.is_first:
                     write_checkpoint(self._run_dir / CHECKPOINT, self.state())
                     last_save = time.monotonic()
@@ -259,19 +257,12 @@ class Training:
     def _finish(self, export: Path | None) -> None:
         learner = self.learner
         learner.ranks.check_same([*learner.alg.actor.parameters(), *learner.alg.critic.parameters()])
-        self.progress.finish_row()
+        self._finish_row()
         if not learner.ranks.is_first:
             return
         write_checkpoint(self._run_dir / CHECKPOINT, self.state())
-        record = {
-            **self._origin,
-            "robot": self.task.robot.name,
-            "iterations": learner.iteration,
-            "num_envs": learner.env.num_envs,
-            **self.progress.state(),
-            "averaged": learner.averaged,
-            **self._facts,
-        }
+        done = {"robot": self.task.robot.name, "iterations": learner.iteration, "num_envs": learner.env.num_envs}
+        record = {**self._origin, **done, **self._dump_progress(), "averaged": learner.averaged, **self._facts}
         for path in filter(None, (self._run_dir / POLICY, export)):
             write_controller(path, learner, record)
             file = path
@@ -280,64 +271,16 @@ class Training:
                 write_atomically(file, format_controller(replace(learner.env.controller, policy=path.name)).encode())
             print(f"Controller and training record written to {file} and {path.with_suffix('.train.json').name}")
 
+    def _dump_progress(self) -> dict[str, Any]:
+        """Plain data for the next piece of the training."""
+        return self._progress | {"wall_s": round(time.monotonic() - self._began, 1)}
 
-def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> None:
-    """Writes the actor, or the mean of the last ones, and the training record ``<stem>.train.json`` beside it.
-
-    Layers are in half precision, which takes half of the space; its error is small beside the differences between
-    trainings. Readers compute in single precision, so that a controller behaves the same wherever it is measured.
-    """
-    buffer = io.BytesIO()
-    trained_on = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # for a copy without its record
-    actor = learner.mean_actor_state()
-    for key, half in {key: value.half() for key, value in actor.items() if value.ndim > 1}.items():
-        if half.isfinite().all():  # not if a number is too large for half precision
-            actor[key] = half
-    activation = "elu" if learner.env.controller is None else learner.env.controller.activation
-    torch.save({"actor_state_dict": actor, "activation": activation, "iter": learner.iteration, **trained_on}, buffer)
-    write_atomically(path, buffer.getvalue())
-    write_atomically(path.with_suffix(".train.json"), to_json(record))
-
-
-class TrainingProgress:
-    """Collects iterations into rows, which are printed, written to TensorBoard and recorded."""
-
-    def __init__(
-        self, run_dir: Path, learner: Learner, iterations: int, *, origin: dict[str, Any], saved: dict[str, Any] | None
-    ) -> None:
-        """Begin a piece of training of ``iterations`` in all; only the first of several processes prints and writes.
-
-        ``origin`` is the provenance of this piece, ``saved`` the :meth:`state` of the pieces before.
-        """
-        self._learner = learner
-        self._iterations = iterations
-        self._state = saved or {"env_steps": 0, "wall_s": 0.0, "pieces": [], "curve": []}
-        self._state["pieces"].append({**origin, "from_iteration": learner.iteration})
-        self._began = time.monotonic() - self._state["wall_s"]
-        self._window: list[Iteration] = []
-        self._events = run_dir / f"events.out.tfevents.{time.time():.0f}.{os.getpid()}"
-        if learner.ranks.is_first:
-            _write_event(self._events, Event(file_version="brain.Event:2"))
-            print(_HEADER, flush=True)
-
-    def add(self, step: Iteration) -> None:
-        """Count an iteration; finish a row if one is due."""
-        self._window.append(step)
-        self._state["env_steps"] += self._learner.steps_per_iteration
-        if self._learner.iteration % max(1, self._iterations // _ROWS) == 0:
-            self.finish_row()
-
-    def state(self) -> dict[str, Any]:
-        """Plain data for the next piece."""
-        return self._state | {"wall_s": round(time.monotonic() - self._began, 1)}
-
-    def finish_row(self) -> None:
-        """Make a row of the iterations since the last one, if there are any."""
-        learner = self._learner
+    def _finish_row(self) -> None:
+        """Makes a row of the iterations since the last one, if there are any."""
         window, self._window = self._window, []
-        task = learner.env.task
         if not window:
             return
+        learner, task = self.learner, self.task
         collection_s = sum(step.collection_s for step in window)
         learning_s = sum(step.learning_s for step in window)
         sums = task.read_statistics()
@@ -346,8 +289,8 @@ class TrainingProgress:
         dt = task.robot.control_dt
         row = {
             "iteration": learner.iteration,
-            "env_steps": self._state["env_steps"],
-            "wall_s": self.state()["wall_s"],
+            "env_steps": self._progress["env_steps"],
+            "wall_s": self._dump_progress()["wall_s"],
             "env_steps_per_s": len(window) * learner.steps_per_iteration / (collection_s + learning_s),
             "collection_s": collection_s / len(window),
             "learning_s": learning_s / len(window),
@@ -367,34 +310,48 @@ class TrainingProgress:
             "learning_rate": learner.alg.learning_rate,
             "noise_std": float(learner.actor_state()[STD].mean()),
         }
-        self._state["curve"].append(_rounded(row))
-        if learner.ranks.is_first:
-            self._print(row)
-            groups = {"train": row} | {name: values for name, values in row.items() if isinstance(values, dict)}
-            tagged = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
-            numbers = {tag: value for tag, value in tagged.items() if isinstance(value, int | float)}
-            scalars = [Summary.Value(tag=tag, simple_value=value) for tag, value in numbers.items()]
-            _write_event(self._events, Event(step=learner.iteration, summary=Summary(value=scalars)))
-
-    def _print(self, row: dict[str, Any]) -> None:
-        left_s = (self._iterations - row["iteration"]) * (row["collection_s"] + row["learning_s"])
+        self._progress["curve"].append(_rounded(row))
+        if not learner.ranks.is_first:
+            return
+        left_s = (self._cfg.iterations - learner.iteration) * (row["collection_s"] + row["learning_s"])
         forms = {"reward": ".2f", "length_s": ".1f", "fall_rate": ".3f", "goal_rate": ".3f"}
         reward, length, falls, goals = (format_value(row[name], None, form) for name, form in forms.items())
         print(
-            f"{clock(left_s):>8} {row['iteration']:>5}/{self._iterations:<4} {row['env_steps_per_s']:>8,.0f} "
+            f"{clock(left_s):>8} {learner.iteration:>5}/{self._cfg.iterations:<4} {row['env_steps_per_s']:>8,.0f} "
             f"{reward:>7} {length:>6}s {falls:>6} {goals:>6} {row['lin_vel_error']:>6.3f} {row['level']:>6.2f} "
             f"{row['noise_std']:>5.2f}",
             flush=True,
         )
         if row["ends"]["invalid"] or row["overflows"]:
             print(f"  {row['ends']['invalid']} invalid states reset, {row['overflows']} steps with a solver overflow")
+        groups = {"train": row} | {name: values for name, values in row.items() if isinstance(values, dict)}
+        tagged = {f"{group}/{name}": value for group, values in groups.items() for name, value in values.items()}
+        numbers = {tag: value for tag, value in tagged.items() if isinstance(value, int | float)}
+        scalars = [Summary.Value(tag=tag, simple_value=value) for tag, value in numbers.items()]
+        self._write_event(step=learner.iteration, summary=Summary(value=scalars))
+
+    def _write_event(self, **content: Any) -> None:
+        """Adds to TensorBoard's file. Its own writer works in a thread, which dies with a traceback on a full disk."""
+        with explain_failed_write(self._events), self._events.open("ab") as opened:
+            RecordWriter(opened).write(Event(wall_time=time.time(), **content).SerializeToString())
 
 
-def _write_event(file: Path, event: Event) -> None:
-    """Adds to TensorBoard's file. Its own writer works in a thread, which dies with a traceback on a full disk."""
-    event.wall_time = time.time()
-    with explain_failed_write(file), file.open("ab") as opened:
-        RecordWriter(opened).write(event.SerializeToString())
+def write_controller(path: Path, learner: Learner, record: dict[str, Any]) -> None:
+    """Writes the actor, or the mean of the last ones, and the training record ``<stem>.train.json`` beside it.
+
+    Layers are in half precision, whose error is small beside the differences between trainings. Readers compute in
+    single precision, so that a controller behaves the same wherever it is measured.
+    """
+    buffer = io.BytesIO()
+    trained_on = {TRAINED_ON: record[TRAINED_ON]} if TRAINED_ON in record else {}  # for a copy without its record
+    actor = learner.mean_actor_state()
+    for key, half in {key: value.half() for key, value in actor.items() if value.ndim > 1}.items():
+        if half.isfinite().all():  # not if a number is too large for half precision
+            actor[key] = half
+    activation = "elu" if learner.env.controller is None else learner.env.controller.activation
+    torch.save({"actor_state_dict": actor, "activation": activation, "iter": learner.iteration, **trained_on}, buffer)
+    write_atomically(path, buffer.getvalue())
+    write_atomically(path.with_suffix(".train.json"), to_json(record))
 
 
 def _rounded(value: Any) -> Any:

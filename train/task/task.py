@@ -43,16 +43,12 @@ _TILE_CENTRE = (8.0, 4.0)
 class CommandTask:
     """``num_envs`` robots following commands on the tiles of the curriculum.
 
-    Torch tensors below are views of the memory the graph works in: the next step overwrites them.
+    Attributes are views of the memory the graph works in, of a row an environment: the next step overwrites them.
 
     Attributes:
-        observation: Observation row of each environment, shape (num_envs, observation_size).
-        reward: Reward of the step just made, shape (num_envs,).
-        end: How the episode ended with it (:class:`kernels.episode.Outcome`), int32, shape (num_envs,).
-        episode_steps: Control steps of the episode so far, int32, shape (num_envs,).
-        levels: Terrain level, int32, shape (num_envs,).
+        end: How the episode ended with the step just made (:class:`kernels.episode.Outcome`), int32.
+        episode_steps: Control steps of the episode so far, int32.
         counter: Control steps since the seed's first number: the state of all random numbers, int32, shape (1,).
-        max_episode_steps: Control steps of the longest episode.
     """
 
     def __init__(
@@ -60,10 +56,7 @@ class CommandTask:
     ) -> None:
         """Build terrain, robots and graph; every episode begins. Without ``tiles``, those of the curriculum."""
         prepare_torch(device)
-        self.robot = robot
-        self.cfg = cfg
-        self.num_envs = num_envs
-        self.device = device
+        self.robot, self.cfg, self.num_envs, self.device = robot, cfg, num_envs, device
         tile_seed, level_seed, model_seed, count_seed = np.random.SeedSequence(seed).generate_state(4)
         first_count = int(count_seed) % 2**30  # far from where a 32-bit counter wraps
         self.tiles = tiles or make_tiles(cfg.curriculum, int(tile_seed))
@@ -141,17 +134,11 @@ class CommandTask:
         self._begin_episodes()
 
     def counts(self) -> dict[str, np.ndarray]:
-        """:data:`STATISTICS` of each environment since the last exchange of terrains, shape (num_envs,) each.
-
-        Synchronises with the device.
-        """
+        """:data:`STATISTICS` of each environment since the last exchange of terrains, shape (num_envs,) each."""
         return dict(zip(STATISTICS, (self._counted + self._statistics).T.cpu().numpy(), strict=True))
 
     def read_statistics(self) -> dict[str, float]:
-        """Sums over all environments since the last call: :data:`STATISTICS`, then each weighted reward term.
-
-        Synchronises with the device.
-        """
+        """Sums over all environments since the last call: :data:`STATISTICS`, then each weighted reward term."""
         sums = torch.cat((self._statistics.sum(0), self._reward_terms.sum(0))).tolist()
         self._counted += self._statistics
         self._statistics.zero_()
@@ -159,15 +146,13 @@ class CommandTask:
         return dict(zip((*STATISTICS, *REWARDS), sums, strict=True))
 
     def level_by_type(self) -> dict[str, float]:
-        """Mean terrain level of the environments of each type. Synchronises with the device."""
+        """Mean terrain level of the environments of each type."""
         levels = self.levels.cpu().numpy()
         types = np.array(self.tiles.type_of_column)[self._column.cpu().numpy()]
         return {str(name): float(levels[types == name].mean()) for name in dict.fromkeys(types)}
 
     def _control_step(self) -> None:
-        sim = self.sim
-        episodes = self._episodes
-        training = self._training
+        sim, episodes, training = self.sim, self._episodes, self._training
         apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
         for step in range(1, self.robot.decimation + 1):
             sim.physics_step()
@@ -183,16 +168,13 @@ class CommandTask:
         self._begin_episodes()
 
     def _begin_episodes(self) -> None:
-        sim = self.sim
-        episodes = self._episodes
-        training = self._training
+        sim, episodes, training = self.sim, self._episodes, self._training
         seed_restarts(training, episodes)
         sim.restart(training.ended, self._robot_step, self._ranges, episodes, self._reward.state)
         command_episodes(sim.joint_q, episodes, self._rules, self._task, sim.joint_qd, training)
         dt = self.robot.control_dt
         if sim.disturbed is not None:
-            row = sim.disturbed.row
-            follow_routes(sim.joint_q, row, self._task, dt, episodes, self.trail, training.command)
+            follow_routes(sim.joint_q, sim.disturbed.row, self._task, dt, episodes, self.trail, training.command)
         sim.observe(self._robot_step, episodes, dt, self._noise, training.counter, training.observation)
         remember_steps(training.last_action, sim.joint_qd, self._reward.state, training.counter)
 
@@ -212,17 +194,11 @@ def _make_task(cfg: TaskCfg, robot: RobotCfg, tiles: Tiles) -> Any:
 
 def _make_rules(cfg: TaskCfg, robot: RobotCfg, tiles: Tiles) -> Any:
     """Commands, pushes and levels of the task as a kernel argument."""
-    return make_struct(
-        Rules,
-        cfg,
-        tiles,
-        crosses=int(cfg.crosses),
-        overflow_mask=CAPACITY_OVERFLOWS,
-        promotion_distance=0.5 * _TILE_SIDE,
-        demotion_time_s=0.5 * cfg.episode_s,
-        command_steps=round(cfg.command_interval_s / robot.control_dt),
-        push_steps=round(cfg.push_interval_s / robot.control_dt),
-    )
+    names = ("command", "push")
+    steps = {f"{name}_steps": round(getattr(cfg, f"{name}_interval_s") / robot.control_dt) for name in names}
+    limits = {"promotion_distance": 0.5 * _TILE_SIDE, "demotion_time_s": 0.5 * cfg.episode_s}
+    limits["overflow_mask"] = CAPACITY_OVERFLOWS
+    return make_struct(Rules, cfg, tiles, crosses=int(cfg.crosses), **limits, **steps)
 
 
 def _make_start_ranges(cfg: TaskCfg, robot: RobotCfg) -> Any:

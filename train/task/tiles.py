@@ -6,17 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.terrains import hand_crafted
 from sim.terrains.bank import make_terrains
-from sim.terrains.hand_crafted import (
-    CROSSING_TYPES,
-    NUM_COLS,
-    NUM_LEVELS,
-    NUM_ROWS,
-    TILE_TYPES,
-    crossing_terrain,
-    hand_crafted_crossings,
-    training_tiles,
-)
+from sim.terrains.hand_crafted import NUM_COLS, NUM_LEVELS, NUM_ROWS
 from sim.terrains.spaces.base import TerrainSpace
 from sim.terrains.terrains import GroundMaps
 from train.cfg import CurriculumCfg, FinetuneCfg
@@ -57,11 +49,11 @@ def make_tiles(cfg: CurriculumCfg, seed: int) -> Tiles:
         raise ValueError("the curriculum needs at least one column, got num_columns 0 and noise_columns 0")
     tile_rng, noise_rng = np.random.default_rng(seed).spawn(2)
     grid = np.empty((NUM_LEVELS, cfg.num_columns + cfg.noise_columns, NUM_ROWS, NUM_COLS), np.float32)
-    tiles, type_index = training_tiles(cfg.num_columns, tile_rng)
+    tiles, type_index = hand_crafted.training_tiles(cfg.num_columns, tile_rng)
     grid[:, : cfg.num_columns] = tiles.reshape(NUM_LEVELS, cfg.num_columns, NUM_ROWS, NUM_COLS)
     for level, column in np.ndindex(NUM_LEVELS, cfg.noise_columns):
-        grid[level, cfg.num_columns + column] = crossing_terrain("noise", level, noise_rng)
-    types = (*(TILE_TYPES[k] for k in type_index), *("noise",) * cfg.noise_columns)
+        grid[level, cfg.num_columns + column] = hand_crafted.crossing_terrain("noise", level, noise_rng)
+    types = (*(hand_crafted.TILE_TYPES[k] for k in type_index), *("noise",) * cfg.noise_columns)
     return Tiles(heights=grid.reshape(-1, NUM_ROWS, NUM_COLS), type_of_column=types)
 
 
@@ -79,48 +71,34 @@ class TrainingElites:
     """Sizes and hash of each archive, for the record."""
 
 
-@dataclass(kw_only=True)
 class Mix:
     """Draws the terrains of each exchange, and counts how often each elite was crossed when it was last trained on.
 
-    The draw depends on the seed, the number of the exchange and, for ``failing`` and ``learnable``, the crossings
-    before. A checkpoint has them all, so a resumed training goes on with the same terrains.
+    A checkpoint has all that a draw depends on, so a resumed training goes on with the same terrains.
+
+    Attributes:
+        goal_rate: Goal rate of each elite, shape (E,), until the elite is trained on; None: 0.
+        swap: Number of the present exchange, from 0.
+        rows: Present elites, in the order of their terrains after the hand-crafted ones.
+        episodes: Valid episodes on each elite when it was last trained on before the present exchange, shape (E,).
+        crossed: How many of them reached the goal.
     """
 
-    cfg: FinetuneCfg
-    elites: TrainingElites
-    """Hand-crafted terrains are scaled by the smallest height share of their spaces."""
-    device: str
-    goal_rate: NDArray[np.float64] | None = field(init=False)
-    """Goal rate of each elite, shape (E,), which ``learnable`` uses until the elite is trained on; None: 0."""
-    swap: int = -1
-    """Number of the present exchange, from 0."""
-    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Present elites, in the order of their terrains after the hand-crafted ones."""
-    episodes: NDArray[np.int64] = field(init=False)
-    """Valid episodes on each elite when it was last trained on before the present exchange, shape (E,)."""
-    crossed: NDArray[np.int64] = field(init=False)
-    """How many of them reached the goal."""
-
-    def __post_init__(self) -> None:
-        self.num_elites = sum(map(len, self.elites.genes))
-        self.goal_rate = self.elites.goal_rate if self.cfg.recipe.draw == "learnable" else None
-        self.num_hand_crafted = self.cfg.terrains if self.cfg.mix == "hand-crafted" else self.cfg.terrains // 2
-        self.episodes = np.zeros(self.num_elites, np.int64)
-        self.crossed = np.zeros(self.num_elites, np.int64)
+    def __init__(self, cfg: FinetuneCfg, elites: TrainingElites, device: str) -> None:
+        self.cfg, self.elites, self.device = cfg, elites, device
+        self.num_elites = sum(map(len, elites.genes))
+        self.num_hand_crafted = cfg.terrains if cfg.mix == "hand-crafted" else cfg.terrains // 2
+        self.goal_rate = elites.goal_rate if cfg.recipe.draw == "learnable" else None
+        self.swap, self.rows = -1, np.zeros(0, np.int64)
+        self.episodes, self.crossed = np.zeros((2, self.num_elites), np.int64)
         self._before_resume = np.zeros((2, self.num_elites), np.int64)
 
     def next(self, counts: dict[str, NDArray[Any]] | None = None) -> Tiles:
-        """The terrains of the next exchange.
-
-        ``counts`` are of the present terrains (:meth:`train.task.task.CommandTask.counts`). They replace older counts
-        of the same elites, which were of the controller at that time.
-        """
+        """The next terrains; ``counts`` of the present ones replace those that their elites had before."""
         if counts is not None:
             episodes, crossed = self._count_present(counts)
-            trained = episodes > 0
-            self.episodes[trained] = episodes[trained]
-            self.crossed[trained] = crossed[trained]
+            self.episodes = np.where(episodes > 0, episodes, self.episodes)
+            self.crossed = np.where(episodes > 0, crossed, self.crossed)
             self._before_resume[:] = 0
         self.swap += 1
         self.rows = self.draw_rows()
@@ -128,46 +106,40 @@ class Mix:
 
     def terrains(self) -> Tiles:
         """The terrains of the present exchange: one level, a terrain a column, hand-crafted ones first."""
-        rng = self._rng(0)
+        rng, spaces = self._rng(0), self.elites.spaces
         first = self.num_hand_crafted
-        hand_crafted, numbers, _ = hand_crafted_crossings(first, rng)
-        hand_crafted *= np.float32(min(space.height_share for space in self.elites.spaces))
-        types = tuple(CROSSING_TYPES[number] for number in numbers)
+        heights, numbers, _ = hand_crafted.hand_crafted_crossings(first, rng)
+        heights *= np.float32(min(space.height_share for space in spaces))
+        types = tuple(hand_crafted.CROSSING_TYPES[number] for number in numbers)
         if self.cfg.mix == "hand-crafted":
-            return Tiles(heights=hand_crafted, type_of_column=types)
+            return Tiles(heights=heights, type_of_column=types)
         count = self.cfg.terrains - first
-        rows = self.rows
-        genes = self.elites.genes
+        rows, genes = self.rows, self.elites.genes
         if self.cfg.mix == "hard-random":
-            rows = np.arange(count)
-            genes = (self.elites.spaces[0].hard_random(count, rng),)
-        heights = np.concatenate([hand_crafted, np.empty((count, NUM_ROWS, NUM_COLS), np.float32)])
+            rows, genes = np.arange(count), (spaces[0].hard_random(count, rng),)
+        heights = np.concatenate([heights, np.empty((count, NUM_ROWS, NUM_COLS), np.float32)])
         ground = GroundMaps.plain(first)
-        if any(space.has_conditions for space in self.elites.spaces):
+        if any(space.has_conditions for space in spaces):
             ground = replace(ground, conditions=ground.rows)
         order = [np.arange(first)]
         start = 0
-        for elites, space in zip(genes, self.elites.spaces, strict=True):
+        for elites, space in zip(genes, spaces, strict=True):
             (drawn,) = np.nonzero((start <= rows) & (rows < start + len(elites)))
             if len(drawn):
                 heights[first + drawn], maps = make_terrains(elites[rows[drawn] - start], space, device=self.device)
                 ground = ground.joined(maps or GroundMaps.plain(len(drawn)))
                 order.append(first + drawn)
             start += len(elites)
-        is_plain = not any(space.ground or space.has_conditions for space in self.elites.spaces)
+        is_plain = not any(space.ground or space.has_conditions for space in spaces)
         ground = None if is_plain else ground[np.argsort(np.concatenate(order))]
         return Tiles(heights=heights, type_of_column=(*types, *(self.cfg.mix,) * count), ground=ground)
 
     def state(self, counts: dict[str, NDArray[Any]]) -> dict[str, Any]:
         """Plain values for a checkpoint, with the counts on the present terrains so far."""
-        present = self._count_present(counts)
-        return {
-            "swap": self.swap,
-            "goal_rate": None if self.goal_rate is None else self.goal_rate.tolist(),
-            **{name: getattr(self, name).tolist() for name in _SAVED},
-            "present_episodes": present[0].tolist(),
-            "present_crossed": present[1].tolist(),
-        }
+        present = zip(("present_episodes", "present_crossed"), self._count_present(counts).tolist(), strict=True)
+        goal_rate = None if self.goal_rate is None else self.goal_rate.tolist()
+        saved = {name: getattr(self, name).tolist() for name in _SAVED}
+        return {"swap": self.swap, "goal_rate": goal_rate, **saved, **dict(present)}
 
     def restore(self, state: dict[str, Any]) -> Tiles:
         """Restore the state of a checkpoint; returns its terrains."""
@@ -190,8 +162,7 @@ class Mix:
         """Elites of the next exchange: none twice, unless there are too few."""
         if self.cfg.mix != "generated":
             return np.zeros(0, np.int64)
-        rng = self._rng(1)
-        count = self.num_elites
+        rng, count = self._rng(1), self.num_elites
         num_drawn = self.cfg.terrains - self.num_hand_crafted
         all_elites = np.tile(np.arange(count), num_drawn // count)
         rate = self.success()

@@ -24,14 +24,12 @@ _Layers = tuple[tuple[Tensor, Tensor], ...]
 
 
 class Networks(nn.Module):
-    """Small convolutional networks side by side, as groups of channels.
+    """Small convolutional networks side by side, each of which maps ``num_maps`` maps to ``num_out`` numbers.
 
     Convolutions slide along the way, and mean and maximum pool what they find, so that an obstacle is the same wherever
-    it lies. The last convolution also sees the position along the way, as cosines: networks learn from these in fewer
-    steps than from one coordinate. Each network maps ``num_maps`` maps of a terrain to ``num_out`` numbers.
-
-    Parameters are weights and biases of each layer in turn, all zero, of shapes (MEMBERS * out, in, *size) and
-    (MEMBERS * out,). Weights lie in memory as convolutions are fastest, on the CPU and on CUDA.
+    it lies. The last convolution also sees the position along the way, as cosines, from which networks learn in fewer
+    steps than from one coordinate. Parameters are weights and biases of each layer in turn, all zero, of shapes
+    (MEMBERS * out, in, *size) and (MEMBERS * out,), in the layout of memory in which convolutions are fastest.
     """
 
     def __init__(self, num_maps: int, num_out: int) -> None:
@@ -103,9 +101,8 @@ def _block_diagonal(weight: Tensor) -> Tensor:
 class Trainer:
     """Steps of AdamW that read and write fixed memory, so that CUDA can repeat one of them as a graph.
 
-    The graph holds the memory of weights and moments, so networks that are moved need a new trainer. On CUDA all steps
-    must be taken on one stream, other than the default one. ``loss`` takes outputs and targets, both of shape (batch,
-    MEMBERS, num_out). ``moments`` are what Adam remembered of each tensor of weights.
+    Networks that are moved need a new trainer. On CUDA all steps must be taken on one stream, other than the default
+    one. ``loss`` takes outputs and targets, both of shape (batch, MEMBERS, num_out).
     """
 
     def __init__(

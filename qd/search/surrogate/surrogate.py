@@ -1,8 +1,7 @@
 """A surrogate of the simulation: networks that learn from all crossings what a terrain does to the robot.
 
-The inner loop searches the archive that they predict, and lets robots cross what promises most (after DSAGE: Bhatt et
-al. 2022, "Deep Surrogate Assisted Generation of Environments"). What a terrain promises is the QD score that it is
-expected to add, where its ratios may be as far from the predicted ones as those of earlier terrains were.
+The inner loop searches the archive that they predict, and lets robots cross what should add most to the QD score (after
+DSAGE: Bhatt et al. 2022), where ratios may be as far from the predicted ones as those of earlier terrains were.
 """
 
 from typing import Any, NamedTuple
@@ -66,16 +65,13 @@ class Prediction(NamedTuple):
 class Surrogate:
     """Networks, what they have learned from, and the inner loop; ``stream`` seeds weights, draws and proposals.
 
-    ``cfg`` has the settings of :class:`qd.search.methods.SurrogateCfg`. With ``crossed`` in the ``fitness``, networks
-    also learn whether anybody crosses a terrain.
+    With ``crossed`` in the ``fitness``, networks also learn whether anybody crosses a terrain.
     """
 
     def __init__(
         self, cfg: Any, cells: Cells, space: TerrainSpace, stream: np.random.SeedSequence, *, fitness: FitnessCfg
     ) -> None:
-        self.cfg = cfg
-        self.cells = cells
-        self.fitness = fitness
+        self.cfg, self.cells, self.fitness = cfg, cells, fitness
         self.space_name, self.space_sha256 = space.name, space.sha256  # a checkpoint holds no code
         self._rng = np.random.default_rng(stream)
         self._genes = np.zeros((0, space.num_genes), np.int16)
@@ -247,8 +243,8 @@ class Surrogate:
     def find_share(self, genes: Any, chance: Any) -> Any:
         """Share of their worth that terrains keep: less, the less anybody crosses them, and the less likely they are.
 
-        Genes, (N, num_genes), and the ``chance`` that somebody crosses each, (..., N), are arrays or tensors, and so is
-        the share, (..., N); None if all keep all.
+        Genes, (N, num_genes), the ``chance`` that somebody crosses each, and the share, (..., N), are arrays or
+        tensors; None if all keep all.
         """
         cfg = self.fitness
         share = 1.0 - cfg.crossed * (1.0 - chance) if cfg.crossed else None
@@ -274,9 +270,8 @@ class Surrogate:
     ) -> NDArray[np.float32]:
         """Terrains for robots to cross: hard-random ones before there is an elite, varied elites before it has learned.
 
-        Genes of the ``elites`` have shape (E, num_genes), and of ``pending`` terrains, which robots are to cross
-        already, (U, num_genes). Those proposed are in [-1, 1], (count, num_genes). What elites are ``worth`` is their
-        fitness, or less (:func:`qd.search.fitness.find_worth`).
+        Genes of ``elites`` are (E, num_genes), of ``pending`` terrains, which robots are to cross already, (U,
+        num_genes), of proposals (count, num_genes), in [-1, 1]. What elites are ``worth`` is their fitness, or less.
         """
         if not len(elites):
             return self.space.hard_random(count, self._rng)
@@ -379,11 +374,7 @@ def label_loss(logits: Tensor, labels: Tensor) -> Tensor:
 
 
 def vary_elites(pool: Tensor, count: int, cfg: Any, genes_per_part: int | None, draw: torch.Generator) -> Tensor:
-    """Children, (count, num_genes), beside the lines between elites, (E, num_genes), of iso+line; in [-1, 1].
-
-    Where the space has parts (:attr:`sim.terrains.spaces.base.TerrainSpace.genes_per_part`), a share of the children
-    takes each part from a third elite with a chance of a half.
-    """
+    """Children, (count, num_genes), of elites by iso+line; a share of them takes parts from a third elite."""
     options = {"generator": draw, "device": pool.device}
     first, second, third = pool[torch.randint(len(pool), (3, count), **options)]
     noise = cfg.iso_sigma * torch.randn(first.shape, **options)
