@@ -22,7 +22,7 @@ ROOMS = ("kernels", "sim", "qd", "train")
 ROOT = Path(__file__).resolve().parents[2]
 """Folder of the rooms."""
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
-_SOURCES = (".py", ".cu", ".xml")
+_SOURCES = (".py", ".cu", ".toml", ".xml")
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def versions() -> dict[str, str]:
 
 
 def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:
-    """SHA-256 of the source files of rooms: Python, CUDA and robot models."""
+    """SHA-256 of the source files of rooms: Python, CUDA, robots and tables of settings."""
     digest = hashlib.sha256()
     for room in rooms:
         for path in sorted((ROOT / room).rglob("*")):
