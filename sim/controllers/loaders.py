@@ -30,14 +30,11 @@ _print_once = functools.cache(print)
 
 
 def prepare_torch(device: str) -> None:
-    """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting.
-
-    On the CPU, torch gets one thread, as Warp has: batches are small, and a second thread only waits on a busy core.
-    """
+    """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting."""
     if device.startswith("cuda"):
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
     else:
-        torch.set_num_threads(1)
+        torch.set_num_threads(1)  # as Warp has: batches are small, and a second thread only waits on a busy core
 
 
 class _TorchMemory:
@@ -52,24 +49,23 @@ class _TorchMemory:
 
 @contextmanager
 def on_stream(stream: torch.cuda.Stream | None) -> Iterator[None]:
-    """Let torch and Warp work on ``stream``; neither it nor the present one waits for the other.
+    """Let torch and Warp work on ``stream``, if any, while neither it nor the present one waits for the other.
 
-    Warp's arrays that are made meanwhile must not be used afterwards. None changes nothing.
+    Warp's arrays that are made meanwhile must not be used afterwards.
     """
     if stream is None:
         yield
-        return
-    on_warp = wp.stream_from_torch(stream)
-    memory = wp.ScopedAllocator(on_warp.device, _TorchMemory())
-    with torch.cuda.stream(stream), wp.ScopedStream(on_warp, sync_enter=False), memory:
-        yield
+    else:
+        on_warp = wp.stream_from_torch(stream)
+        memory = wp.ScopedAllocator(on_warp.device, _TorchMemory())
+        with torch.cuda.stream(stream), wp.ScopedStream(on_warp, sync_enter=False), memory:
+            yield
 
 
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Loads a controller, as :class:`ControllerSpec` names it, and tries it on rows of the robot, on a Warp device.
 
-    Files are loaded as data only, though C++ reads TorchScript and ONNX, which a file made to harm can crash; code runs
-    only from a module or Python file that is named. A warning says if the record of a training names another robot.
+    Files are loaded as data only; code runs only from a module or Python file that is named.
     """
     device = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
     if device != "cpu" and not torch.cuda.is_available():
@@ -209,10 +205,9 @@ def _separates_rows(policy: Any, width: int, device: str) -> bool:
         steps[0, 1] = row  # between the others: sums from either side differ
         try:
             reset_all(policy, count, device)
-            actions = [policy(step.to(device))[1].clone() for step in steps]
+            first_actions.append([policy(step.to(device))[1].clone() for step in steps][0])
         except Exception:  # a controller can fail with anything
             return False
-        first_actions.append(actions[0])
     return torch.allclose(*first_actions, rtol=1e-3, atol=1e-3, equal_nan=True)
 
 

@@ -34,8 +34,7 @@ def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
 class Memory(Enum):
     """What a policy remembers from one step to the next, by its ``reset``."""
 
-    NONE = "no reset"
-    """Nothing."""
+    NONE = "no reset"  # nothing
     PER_ROBOT = "reset(rows)"
     """Each robot. Before every step ``rows``, bool, shape (num_envs,), is true where a robot begins an episode."""
     SHARED = "reset()"
@@ -66,8 +65,7 @@ def reset_all(policy: Any, num_envs: int, device: str = "cpu") -> bool:
 class Recurrent(torch.nn.Module):
     """A network with a state of each robot, for any number of robots, at fixed addresses of the device."""
 
-    graph_safe = True
-    """Whether steps, and a reset, may be captured as a CUDA graph."""
+    graph_safe = True  # whether steps, and a reset, may be captured as a CUDA graph
 
     def __init__(self, initial: Sequence[torch.Tensor], axis: int) -> None:
         """States at the start of an episode, with one robot along ``axis``."""

@@ -26,10 +26,8 @@ _NAMED = re.compile(r"(?P<module>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]
 class ControllerSpec:
     """``file``, ``module:callable`` or ``module:adapter@file``; a Python file may stand for the module."""
 
-    module: str | None = None
-    """Module, or file whose name ends in .py; None if no code is named."""
-    name: str | None = None
-    """Name of the callable in it."""
+    module: str | None = None  # module, or file whose name ends in .py; None if no code is named
+    name: str | None = None  # name of the callable in it
     file: str | None = None
 
     @classmethod

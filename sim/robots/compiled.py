@@ -1,7 +1,6 @@
-"""A robot's file as MuJoCo compiles it, in the one form that simulations and pictures are made of, and its drives.
+"""A robot's file as MuJoCo compiles it, and its drives: at most one actuator a joint, with the joint's name.
 
-Each joint has at most one actuator, of the joint's name: of positions, or a motor for an actuator network. Geoms touch
-the ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
+Geoms touch the ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
 """
 
 import itertools
@@ -61,11 +60,9 @@ def joint_names(model: Any) -> tuple[str, ...]:
 
 @lru_cache(maxsize=8)
 def number_links(robot: RobotCfg) -> NDArray[np.int32]:
-    """Bodies by their numbers from ``-LINKS`` to ``LINKS``, shape (2 * LINKS + 1,).
+    """Bodies by their numbers from ``-LINKS`` on the right over 0, the base, to ``LINKS``, shape (2 * LINKS + 1,).
 
-    The base is 0, links on its left have positive numbers, those on its right negative ones, and those in its middle
-    both. They are counted leg after leg, each from the base on, in the model's order. More or fewer than ``LINKS`` on a
-    side have numbers that are spread over them.
+    Links in the middle count on both sides. A side's numbers are spread over its links, in the model's order.
     """
     model = robot_spec(robot).compile()
     data = mj.MjData(model)
@@ -79,7 +76,7 @@ def number_links(robot: RobotCfg) -> NDArray[np.int32]:
 
 
 def number_arm_actuators(robot: RobotCfg, driven: Sequence[int]) -> list[int]:
-    """Actuators of the robot's ``arm_joints``, where each actuator drives a joint by its index in ``joint_names``."""
+    """Actuators of the robot's ``arm_joints``; ``driven`` are the indices of the actuators' joints."""
     return [[*driven].index(robot.joint_names.index(name)) for name in robot.arm_joints]
 
 
@@ -118,31 +115,24 @@ def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 class Drives:
     """Position drives of a robot's joints; arrays have a row a joint."""
 
-    stiffness: NDArray[np.float64]
-    """Position gain [N m/rad]; 0 without a position actuator."""
-    damping: NDArray[np.float64]
-    """Velocity gain [N m s/rad]."""
-    effort: NDArray[np.float64]
-    """Largest torque [N m]; inf without a limit."""
-    targets: NDArray[np.float64]
-    """Range of targets [rad], shape (num_joints, 2); NaN without one."""
-    followers: frozenset[int]
-    """Joints without a drive, which an equality lets follow others."""
+    stiffness: NDArray[np.float64]  # position gain [N m/rad]; 0 without a position actuator
+    damping: NDArray[np.float64]  # velocity gain [N m s/rad]
+    effort: NDArray[np.float64]  # largest torque [N m]; inf without a limit
+    targets: NDArray[np.float64]  # range of targets [rad], shape (num_joints, 2); NaN without one
+    followers: frozenset[int]  # joints without a drive, which an equality lets follow others
 
 
 def read_drives(model: Any) -> Drives:
     """Reads the actuators of a compiled file that has no :func:`drive_problems`."""
-    count = model.njnt - 1
-    stiffness, damping = np.zeros((2, count))
-    effort = np.full(count, np.inf)
-    targets = np.full((count, 2), np.nan)
+    stiffness, damping = np.zeros((2, model.njnt - 1))
+    effort = np.full(model.njnt - 1, np.inf)
+    targets = np.full((model.njnt - 1, 2), np.nan)
     for joint, _, span, scale in _torque_ranges(model):
         effort[joint] = min(effort[joint], scale * float(span[1]))
     for k in range(model.nu):
         if _actuator_kind(model, k) == "position":
             joint = _driven_joint(model, k)
-            stiffness[joint] = model.actuator_gainprm[k, 0]
-            damping[joint] = -model.actuator_biasprm[k, 2]
+            stiffness[joint], damping[joint] = model.actuator_gainprm[k, 0], -model.actuator_biasprm[k, 2]
             if model.actuator_ctrllimited[k]:
                 targets[joint] = model.actuator_ctrlrange[k]
     return Drives(stiffness=stiffness, damping=damping, effort=effort, targets=targets, followers=_followers(model))
@@ -199,8 +189,7 @@ def _actuator_kind(model: Any, k: int) -> str:
         return "an actuator of a plugin"
     if model.actuator_dyntype[k]:
         return "an actuator with a timeconst or other dynamics"
-    gain = model.actuator_gainprm[k]
-    bias = model.actuator_biasprm[k]
+    gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
     is_fixed = model.actuator_gaintype[k] == mj.mjtGain.mjGAIN_FIXED
     is_affine = is_fixed and model.actuator_biastype[k] == mj.mjtBias.mjBIAS_AFFINE and not bias[0]
     if is_fixed and model.actuator_biastype[k] == mj.mjtBias.mjBIAS_NONE and not gain[1:].any():
@@ -241,18 +230,16 @@ def set_drives(spec: Any, drives: Drives, robot: RobotCfg) -> None:
 class RobotFile:
     """Content of a robot's file, without its settings."""
 
-    spec: Any
-    """The ``MjSpec``, stripped to what simulations use; every touching geom has a name."""
+    spec: Any  # the ``MjSpec``, stripped to what simulations use; every touching geom has a name
     model: Any
-    home: list[float] | None
-    """Joint angles of its keyframe ``home`` [rad]; None without one."""
+    home: list[float] | None  # joint angles of its keyframe ``home`` [rad]; None without one
     is_urdf: bool
 
 
 def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
-    """The robot as an ``MjSpec`` that compiles; an error says all that is wrong with its file or its settings.
+    """The robot as an ``MjSpec`` that compiles, the settings before its file; an error says all that is wrong.
 
-    Gains, torque limits, armature and contact of the settings count first. With ``visuals`` a URDF keeps what it shows.
+    With ``visuals`` a URDF keeps what it shows.
     """
     robot_file = read_robot_file(robot.model_file, visuals=visuals)
     if problems := file_problems(robot, robot_file):
@@ -485,8 +472,7 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
         problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")
     gains = drives.stiffness if robot.stiffness is None else robot.stiffness
-    limp = [k for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers)]
+    limp = ", ".join(names[k] for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers))
     if limp and not problems and robot.actuator_net is None:
-        listed = ", ".join(names[k] for k in limp)
-        problems.append(f"no gains for {listed}: give stiffness and damping, or <position> in {robot.model_file}")
+        problems.append(f"no gains for {limp}: give stiffness and damping, or <position> in {robot.model_file}")
     return [*problems, *no_geom]

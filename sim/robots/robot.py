@@ -25,94 +25,59 @@ _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorNetCfg:
-    """A network of all drives, from target less position [rad] and velocity [rad/s] to torque [N m].
+    """A network of all drives, from target less position [rad] and velocity [rad/s] to torque [N m], as Isaac Lab's."""
 
-    Names are Isaac Lab's. ``file`` is TorchScript, relative to the robot's settings. A torque is held for
-    ``decimation`` physics steps.
-    """
-
-    file: Path
+    file: Path  # TorchScript, relative to the robot's settings
     pos_scale: float = 1.0
     vel_scale: float = 1.0
     torque_scale: float = 1.0
     input_order: Literal["pos_vel", "vel_pos"] = "pos_vel"
     input_idx: tuple[NonNegativeInt, ...] = ()
     """Evaluations ago of which dense layers see error and velocity; if empty, the last ones, the newest first."""
-    decimation: PositiveInt = 1
+    decimation: PositiveInt = 1  # physics steps for which a torque is held
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotCfg:
     """What the simulation and the search need to know of a robot beside its model file.
 
-    Base frame: x forward, y left, z up. Gains, effort limits and armature of the shipped robots stand in their MJCF
-    (position actuators), so that any MuJoCo reads the same robot.
+    Base frame: x forward, y left, z up. The drives of the shipped robots stand in their MJCF, for any MuJoCo.
     """
 
-    name: str
-    """Name of its files and folders."""
-    model_file: Path
-    """MJCF, whose first body has the free joint, or URDF; relative to the settings' file."""
-    base_geoms: tuple[str, ...]
-    """Geoms whose touch ends an episode."""
-    foot_geoms: tuple[str, ...]
-    """Geoms it walks on."""
-    limb_geoms: tuple[str, ...]
-    """Geoms whose touch is penalised, beside the base's."""
-    joint_names: tuple[str, ...]
-    """Actuated joints in policy order, which is the file's order."""
-    default_joint_pos: tuple[float, ...]
-    """Default pose [rad]; an action of 0 holds it."""
-    default_base_height: NonNegativeFloat = 0.0
-    """Height of the base over flat ground at the start [m]; if 0, the lowest one with no foot in the ground."""
-    footprint: tuple[PositiveFloat, PositiveFloat]
-    """Half length and half width of the stance [m]."""
-    scan_x: tuple[float, ...]
-    """Height-scan points ahead of the base, yaw frame [m]."""
-    scan_y: tuple[float, ...]
-    """Height-scan points left of the base, yaw frame [m]."""
-    contact_force_limit: PositiveFloat
-    """Contact force of a foot beyond which it is penalised [N]."""
-    penalties: tuple[str, ...]
-    """Raw penalties that count, a subset of :data:`kernels.penalties.PENALTIES`."""
-    collision_bit: bool
-    """Whether base collision is a descriptor of its own (the paper: Cassie)."""
-    senses: tuple[Literal["pose", "contacts", "torques"], ...] = ()
-    """What stands after the scan in the observation row: :data:`kernels.observation` says it."""
-    arm_joints: tuple[str, ...] = ()
-    """Joints of arms, which its controller does not move; the conditions of ``+arms`` do."""
-    action_scale: PositiveFloat = 0.5
-    """Radians per unit of action."""
+    name: str  # name of its files and folders
+    model_file: Path  # MJCF, whose first body has the free joint, or URDF; relative to the settings' file
+    base_geoms: tuple[str, ...]  # geoms whose touch ends an episode
+    foot_geoms: tuple[str, ...]  # geoms it walks on
+    limb_geoms: tuple[str, ...]  # geoms whose touch is penalised, beside the base's
+    joint_names: tuple[str, ...]  # actuated joints in policy order, which is the file's order
+    default_joint_pos: tuple[float, ...]  # default pose [rad]; an action of 0 holds it
+    default_base_height: NonNegativeFloat = 0.0  # at the start [m]; if 0, the lowest one with no foot in the ground
+    footprint: tuple[PositiveFloat, PositiveFloat]  # half length and half width of the stance [m]
+    scan_x: tuple[float, ...]  # height-scan points ahead of the base, yaw frame [m]
+    scan_y: tuple[float, ...]  # height-scan points left of the base, yaw frame [m]
+    contact_force_limit: PositiveFloat  # contact force of a foot beyond which it is penalised [N]
+    penalties: tuple[str, ...]  # raw penalties that count, a subset of :data:`kernels.penalties.PENALTIES`
+    collision_bit: bool  # whether base collision is a descriptor of its own (the paper: Cassie)
+    senses: tuple[Literal["pose", "contacts", "torques"], ...] = ()  # after the scan: :mod:`kernels.observation`
+    arm_joints: tuple[str, ...] = ()  # that its controller does not move; the conditions of ``+arms`` do
+    action_scale: PositiveFloat = 0.5  # radians per unit of action
     physics_dt: Annotated[float, Meta(gt=0, le=0.05)] = 0.005
-    decimation: Annotated[int, Meta(ge=1, le=1000)] = 4
-    """Physics steps per control step."""
-    speed: PositiveFloat = 0.75
-    """Commanded speed of a crossing, toward the goal [m/s]."""
-    max_duration_s: PositiveFloat = 20.0
-    """Time after which a crossing ends [s]; the goal is 12 m away."""
-    max_speed: PositiveFloat = 100.0
-    """A state with a larger velocity is invalid [m/s or rad/s]: no robot reaches it, not even in a fall."""
-    nconmax: PositiveInt = 40
-    """Largest number of contacts of a robot with the ground."""
-    stiffness: tuple[PositiveFloat, ...] | None = None
-    """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
-    damping: tuple[NonNegativeFloat, ...] | None = None
-    """Velocity gain of each joint [N m s/rad], together with ``stiffness``."""
-    effort_limit: tuple[PositiveFloat, ...] | None = None
-    """Largest torque of each joint [N m]; the file's if None, and never more than that of its actuators."""
-    armature: tuple[NonNegativeFloat, ...] | None = None
-    """Inertia of each joint's rotor, behind its gears [kg m^2]; the file's if None."""
-    saturation_effort: tuple[PositiveFloat, ...] | None = None
-    """Stall torque of each joint's DC motor [N m], together with ``velocity_limit``; None for ideal PD.
-
-    The motor is Isaac Lab's ``DCMotor`` since its pull request 2300: at a joint velocity v the torque of the PD gains
-    is clipped to saturation * (-1 - v / limit) and saturation * (1 - v / limit), and these to the effort limit, which
-    may be more or less. So beyond the speed limit a motor brakes, whatever its target.
-    """
-    velocity_limit: tuple[PositiveFloat, ...] | None = None
-    """Speed of each joint at which its motor has no torque left [rad/s]."""
-    actuator_net: ActuatorNetCfg | None = None
-    """Network in place of PD gains; its torque is clipped as theirs is."""
+    decimation: Annotated[int, Meta(ge=1, le=1000)] = 4  # physics steps per control step
+    speed: PositiveFloat = 0.75  # commanded speed of a crossing, toward the goal [m/s]
+    max_duration_s: PositiveFloat = 20.0  # time after which a crossing ends [s]; the goal is 12 m away
+    max_speed: PositiveFloat = 100.0  # a larger velocity is invalid [m/s or rad/s]: no robot reaches it in a fall
+    nconmax: PositiveInt = 40  # largest number of contacts of a robot with the ground
+    # Of each joint; the file's if None. A URDF, or an MJCF without position actuators, needs stiffness and damping.
+    stiffness: tuple[PositiveFloat, ...] | None = None  # position gain [N m/rad]
+    damping: tuple[NonNegativeFloat, ...] | None = None  # velocity gain [N m s/rad]
+    effort_limit: tuple[PositiveFloat, ...] | None = None  # largest torque [N m], never more than the actuators'
+    armature: tuple[NonNegativeFloat, ...] | None = None  # inertia of the rotor, behind its gears [kg m^2]
+    # Isaac Lab's DCMotor since its pull request 2300; None for ideal PD. At a joint velocity v, the torque of the gains
+    # is clipped to saturation * (-1 - v / limit) and saturation * (1 - v / limit), and these to the effort limit, which
+    # may be more or less. So beyond the speed limit a motor brakes, whatever its target.
+    saturation_effort: tuple[PositiveFloat, ...] | None = None  # stall torque [N m]
+    velocity_limit: tuple[PositiveFloat, ...] | None = None  # speed without torque [rad/s]
+    actuator_net: ActuatorNetCfg | None = None  # network in place of PD gains; its torque is clipped as theirs is
     drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
     """Physics steps by which joint targets are late. Until the first one arrives, the default pose is held."""
     friction: PositiveFloat | None = None
@@ -122,10 +87,8 @@ class RobotCfg:
     training: TrainingCfg = field(default_factory=TrainingCfg)
     learning: LearningCfg = field(default_factory=LearningCfg)
     tuning: TuningCfg = field(default_factory=TuningCfg)
-    label: str = ""
-    """Name of a shipped robot as its makers write it."""
-    paper: PaperCfg = field(default_factory=PaperCfg)
-    """What the paper did with a shipped robot."""
+    label: str = ""  # name of a shipped robot as its makers write it
+    paper: PaperCfg = field(default_factory=PaperCfg)  # what the paper did with a shipped robot
     settings_file: Path | None = None
     """File of a user's robot, TOML or Python, set by :func:`sim.robots.find.get_robot`; None of a shipped robot."""
 
@@ -211,9 +174,9 @@ def needed_senses(terms: Iterable[str]) -> list[str]:
 
 
 def robot_digest(robot: RobotCfg) -> str:
-    """SHA-256 of a robot: its settings without those of training, its model and its meshes.
+    """SHA-256 of a robot: its model, its meshes, and its settings but those of training and those at their default.
 
-    A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
+    So a new setting changes no hash; the default of an old one must stay.
     """
     defaults = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(robot)}
     counted = {name: value for name, value in vars(robot).items() if name not in _NOT_IN_DIGEST}

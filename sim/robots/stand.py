@@ -46,26 +46,17 @@ class Standing:
     """How a robot stood in its default pose, and how the dropped ones lay."""
 
     robot: RobotCfg
-    height: tuple[float, float]
-    """Height of the base at the start and at the end [m]."""
-    right_height: float
-    """Lowest height of the base at which no foot starts in the ground [m]."""
-    bottoms: dict[str, float]
-    """Lowest point of each geom at the start, over the ground [m]."""
-    tilt_deg: float
-    """Tilt of the base at the end."""
-    joint_error: float
-    """Largest distance of a joint from its default angle at the end [rad]."""
+    height: tuple[float, float]  # height of the base at the start and at the end [m]
+    right_height: float  # lowest height of the base at which no foot starts in the ground [m]
+    bottoms: dict[str, float]  # lowest point of each geom at the start, over the ground [m]
+    tilt_deg: float  # tilt of the base at the end
+    joint_error: float  # largest distance of a joint from its default angle at the end [rad]
     carried: dict[str, float]
     """Share of the weight that each touching geom carries, on average over the last half second."""
-    restless: float
-    """How much the forces on its feet change from one physics step to the next in that time, in weights."""
-    contacts: int
-    """Largest number of contacts of a robot."""
-    overflowed: bool
-    """Whether there was too little room for contacts, at any time."""
-    finite: bool
-    """Whether all states are numbers at the end."""
+    restless: float  # how much the forces on its feet change from one physics step to the next in that time, in weights
+    contacts: int  # largest number of contacts of a robot
+    overflowed: bool  # whether there was too little room for contacts, at any time
+    finite: bool  # whether all states are numbers at the end
 
     @property
     def stands(self) -> bool:

@@ -34,14 +34,11 @@ SETTINGS = ("default_joint_pos", "stiffness", "damping", "action_scale", "physic
 class Source:
     """Settings that are read from a source, for a robot whose model the user or the source names."""
 
-    file: Path
-    """The file that errors name."""
-    model_file: Path | None
-    """The robot's MJCF or URDF; None until it is known."""
+    file: Path  # the file that errors name
+    model_file: Path | None  # the robot's MJCF or URDF; None until it is known
     settings: dict[str, Any] = field(default_factory=dict)
     """Fields of robot.toml and controller.toml; None where the user has to fill one in."""
-    reasons: dict[str, str] = field(default_factory=dict)
-    """Why a setting is a guess, or what the user should fill in."""
+    reasons: dict[str, str] = field(default_factory=dict)  # why a setting is a guess, or what the user should fill in
 
     @cached_property
     def robot_file(self) -> RobotFile:
