@@ -67,11 +67,10 @@ def _list_marks(path: Path) -> set[str]:
 
 
 def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
-    """Writes robot.toml and controller.toml, with the weights beside them, to the folder ``out``, and prints both.
+    """Writes robot.toml and controller.toml of a source to the folder ``out``, with the weights, and prints both.
 
-    ``path`` is a source of one of :data:`FORMATS`; the robot is called after the folder. ``model`` is what
-    :func:`sim.robots.model_files.find_model` finds; None if the source names its model.
-    Returns whether nothing is left to be filled in.
+    ``model`` is what :func:`sim.robots.model_files.find_model` finds; None if the source names its model. The robot is
+    called after the folder. Returns whether nothing is left to be filled in.
     """
     if existing := [str(out / name) for name in _SETTINGS_BY_FILE if (out / name).exists()]:
         files = " and ".join(existing)

@@ -205,9 +205,10 @@ def _separates_rows(policy: Any, width: int, device: str) -> bool:
         steps[0, 1] = row  # between the others: sums from either side differ
         try:
             reset_all(policy, count, device)
-            first_actions.append([policy(step.to(device))[1].clone() for step in steps][0])
+            actions = [policy(step.to(device))[1].clone() for step in steps]
         except Exception:  # a controller can fail with anything
             return False
+        first_actions.append(actions[0])
     return torch.allclose(*first_actions, rtol=1e-3, atol=1e-3, equal_nan=True)
 
 

@@ -35,10 +35,8 @@ class Memory(Enum):
     """What a policy remembers from one step to the next, by its ``reset``."""
 
     NONE = "no reset"  # nothing
-    PER_ROBOT = "reset(rows)"
-    """Each robot. Before every step ``rows``, bool, shape (num_envs,), is true where a robot begins an episode."""
-    SHARED = "reset()"
-    """All robots, which can only begin together; robots whose episode has ended stand idle until then."""
+    PER_ROBOT = "reset(rows)"  # each robot; before every step rows, bool, (num_envs,), are true where one begins anew
+    SHARED = "reset()"  # all robots, which begin together; those whose episode has ended stand idle until then
 
 
 def find_memory(policy: Any) -> Memory:
@@ -105,10 +103,7 @@ class Recurrent(torch.nn.Module):
 
 
 def is_graph_safe(policy: Any) -> bool:
-    """Whether a policy may be captured as a CUDA graph: as its ``graph_safe`` says, else a module without memory.
-
-    It has fixed shapes then, and its ``reset(rows)`` writes in place.
-    """
+    """Whether a policy may be captured as a CUDA graph: as its ``graph_safe`` says, else a module without memory."""
     return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and find_memory(policy) is Memory.NONE)
 
 
@@ -116,10 +111,7 @@ class PolicyRunner:
     """Runs a policy between two Warp buffers; one that :func:`is_graph_safe` is captured as a CUDA graph."""
 
     def __init__(self, policy: Any, observation: Any, action: Any, begins: Any) -> None:
-        """Binds the policy to Warp arrays (num_envs, observation_size), (num_envs, num_joints) and (num_envs,).
-
-        ``begins`` is not 0 where an episode begins with the coming step.
-        """
+        """Binds the policy to Warp arrays; ``begins`` is not 0 where an episode begins with the coming step."""
         self._policy = policy
         self.memory = find_memory(policy)
         self._observation, self._action, self._begins = map(wp.to_torch, (observation, action, begins))

@@ -17,8 +17,7 @@ from typing import Any
 from sim.files.provenance import ROOMS, ROOT
 from sim.robots.robot import RobotCfg, robot_identity
 
-SHIPPED = "shipped"
-"""Name of the controller that comes with the robot."""
+SHIPPED = "shipped"  # name of the controller that comes with the robot
 _NAMED = re.compile(r"(?P<module>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
 
 
@@ -100,10 +99,7 @@ def resolve_policy(policy: str, robot: RobotCfg) -> str:
 
 
 def controller_hash(policy: str | Path) -> str | None:
-    """SHA-256 of a controller's file, or of all its files and the callable's name; None if a file is missing.
-
-    Files that code reads or imports are not part of it.
-    """
+    """SHA-256 of a controller's file, or of all that it names and the callable's name; None if a file is missing."""
     spec = ControllerSpec.parse(policy)
     files = list(spec.files)
     if spec.module is not None and not spec.module.endswith(".py"):
@@ -184,10 +180,7 @@ def describe_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dic
 
 
 def parse_controllers(policies: Sequence[str], robot: RobotCfg, *, flag: str = "policies") -> dict[str, str]:
-    """Policy of each controller by its name, in the order given; the robot's own as ``base`` if there is none.
-
-    Each is ``NAME=POLICY``; a text may hold several, with spaces. Errors name the ``flag``.
-    """
+    """Policy of each controller by its name, of texts of ``NAME=POLICY``; the robot's as ``base`` without any."""
     text = " ".join(policies).strip() or f"base={SHIPPED}"
     controllers: dict[str, str] = {}
     for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is

@@ -57,10 +57,7 @@ def _label_columns(controller: Described) -> list[str]:
 
 @torch.inference_mode()
 def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
-    """The first differences between a log and a contract, as lines; none if they agree as far as the log says.
-
-    The log begins with an episode, and has every control step.
-    """
+    """The first differences, as lines, between a contract and a log of every control step from an episode's start."""
     controller = load_policy(policy, robot, "cpu")
     if not isinstance(controller, Described):
         raise ValueError(f"--trace needs a controller.toml, whose columns have names, got {policy}")

@@ -16,11 +16,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-ROOMS = ("kernels", "sim", "qd", "train")
-"""Folders of the source code."""
+ROOMS = ("kernels", "sim", "qd", "train")  # folders of the source code
 
-ROOT = Path(__file__).resolve().parents[2]
-"""Folder of the rooms."""
+ROOT = Path(__file__).resolve().parents[2]  # folder of the rooms
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
 _SOURCES = (".py", ".cu", ".toml", ".xml")
 
@@ -28,8 +26,8 @@ _SOURCES = (".py", ".cu", ".toml", ".xml")
 def provenance(device: str, seed: int) -> dict[str, Any]:
     """Command (by :func:`without_machine`), commit, hash of the sources, device, versions, seed and date of a result.
 
-    ``dirty`` says whether sources or scripts differ from the commit; None if git cannot tell. FAULTLINE_COMMIT names
-    the commit where there is no git, and ends in -dirty if they differ.
+    ``dirty``: sources or scripts differ from the commit; None if git cannot tell. FAULTLINE_COMMIT, which may end in
+    -dirty, names the commit where there is no git.
     """
     variable = os.environ.get("FAULTLINE_COMMIT", "")
     commit = variable.removesuffix("-dirty") or None

@@ -18,10 +18,9 @@ Array = NDArray[np.float64]
 
 
 class ActuatorNet:
-    """A network of ``count`` drives from the beginning of an episode on, in NumPy.
+    """A network of ``count`` drives from the beginning of an episode on, as :func:`kernels.actuator_net.make_torques`.
 
-    ``layers`` are matrices, the bias first, with rows gate by gate of an LSTM; ``sizes``, ``inputs``,
-    ``num_recurrent``, ``activation`` and ``history`` are those of :func:`kernels.actuator_net.make_torques`.
+    ``layers`` are matrices, the bias first, with rows gate by gate of an LSTM.
     """
 
     def __init__(self, cfg: ActuatorNetCfg, count: int = 0) -> None:

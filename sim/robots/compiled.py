@@ -22,8 +22,7 @@ from sim.files.command import with_traceback
 from sim.robots.model_files import ModelFiles, read_model_files
 from sim.robots.robot import RobotCfg
 
-mj: Any = mujoco
-"""MuJoCo, whose stubs lack most types."""
+mj: Any = mujoco  # MuJoCo, whose stubs lack most types
 _JOINT = mj.mjtTrn.mjTRN_JOINT
 _GAINS = ("stiffness", "damping", "effort_limit", "armature")
 PER_JOINT = ("default_joint_pos", *_GAINS, "saturation_effort", "velocity_limit")

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 _PACKAGE = "package://"
-MENAGERIE = "menagerie:"
-"""What a model of MuJoCo Menagerie begins with."""
+MENAGERIE = "menagerie:"  # what a model of MuJoCo Menagerie begins with
 _SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf", ".png")  # .msh: MuJoCo's own
 
 

@@ -35,8 +35,7 @@ class Strip:
 _MESH_TOLERANCE = 0.01  # farthest that a point of a hull's surface may lie outside of the nearest probe [m]
 _SMALL_MESH_SHARE = 1.0 / 12.0  # of a small mesh's longest side, its tolerance
 _MAX_PROBE_RADIUS = 0.1  # [m]
-MAX_MESH_PROBES = 400
-"""Probes of one mesh; one that would need more is covered as closely as these reach."""
+MAX_MESH_PROBES = 400  # probes of one mesh; one that would need more is covered as closely as these reach
 _WIDE = 0.1  # a wider mesh lies on two rows of probes, left and right [m]
 _SAMPLES_PER_TOLERANCE = 2.0
 _GROWTH = 1.25
@@ -129,10 +128,8 @@ def hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
     return [*_rows(*balls, corners)], tolerance
 
 
-MAX_SAG = 0.005
-"""Deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]."""
-CAPSULE_SAG = 0.0005
-"""Deepest that it may sink between those of a capsule [m]: limbs stand, slide and hang on edges with them."""
+MAX_SAG = 0.005  # deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]
+CAPSULE_SAG = 0.0005  # deepest that it may sink between those of a capsule, by which limbs hang on edges [m]
 _MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose edges the probes round off [m]
 _MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
 

@@ -16,10 +16,7 @@ from sim.controllers.runner import Recurrent, is_graph_safe, with_rows_of_zeros
 from sim.controllers.spec import in_one_line
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
-"""Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size).
-
-A policy that remembers has a method ``reset``, of a kind of :class:`sim.controllers.runner.Memory`.
-"""
+"""Actions (num_envs, num_joints) of observation rows (num_envs, observation_size); with ``reset`` if it remembers."""
 
 
 def load_network(
@@ -27,9 +24,8 @@ def load_network(
 ) -> Policy:
     """The network of a checkpoint, TorchScript or ONNX file, with a ``reset(rows)`` if it remembers.
 
-    ``sizes`` are the columns and actions that it must have, which errors call those of ``label``; None takes those of
-    the file, and a TorchScript module as it is. ``activation`` stands between the layers of a checkpoint; None takes
-    that of its file or training.
+    ``sizes`` are the columns and actions that it must have, those of ``label``; None takes the file's and a
+    TorchScript module as it is. ``activation`` is that of a checkpoint; None takes its file's or training's.
     """
     if path.suffix.lower() == ".onnx":
         from sim.controllers.formats.onnx import load_onnx  # onnxruntime takes long to load, and few files need it

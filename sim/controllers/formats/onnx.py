@@ -205,12 +205,9 @@ _LAYERS: dict[str, Callable[..., Any]] = {
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
     """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
 
-    Its inputs are columns of the observation (batch, observation_size) in their order, and the states that it returned;
-    its outputs actions (batch, num_joints), and states called X_out for the inputs X or X_in. Others are ignored. Only
-    these files are read; no code runs.
-
-    A graph of plain layers becomes a torch module, if it maps random rows as onnxruntime does. Another graph for one
-    robot is changed into one for any number, if that acts on each robot as before; else it runs once a robot.
+    Its inputs are columns of the observation in their order, and the states that it returned; its outputs actions, and
+    states called X_out for the inputs X or X_in. A graph of plain layers becomes a torch module, another one for one
+    robot a graph for any number, if that acts as before on random rows; else it runs once a robot.
     """
     target = torch.device(device)
     try:
@@ -266,10 +263,9 @@ def _free_batch(model: Any, ports: _Ports) -> bytes:
 
 
 def export_onnx(policy: MlpPolicy, path: Path) -> None:
-    """Writes a policy as one self-contained file that ends in .onnx; its folder is made if need be.
+    """Writes a policy as one .onnx file: ``observation`` (batch, observation_size) to ``action`` (batch, num_joints).
 
-    Its input is ``observation``, shape (batch, observation_size), its output ``action``, shape (batch, num_joints),
-    both float32, the batch free. The same policy gives the same bytes.
+    Both are float32, the batch is free. The same policy gives the same bytes.
     """
     if path.suffix.lower() != ".onnx":
         raise ValueError(f"'{path}' must end in .onnx, by which controllers of that kind are known")
