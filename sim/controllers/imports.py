@@ -8,18 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from sim.controllers.described import read_controller
-from sim.controllers.formats.booster import read_booster
-from sim.controllers.formats.deploy_yaml import read_deploy_yaml
-from sim.controllers.formats.holosoma import read_holosoma
+from sim.controllers.formats.deployments import read_deploy_yaml, read_rl_sar, read_unitree_rl_gym
+from sim.controllers.formats.isaac_gym import read_booster, read_legged_gym
 from sim.controllers.formats.isaac_lab import read_isaac_lab
 from sim.controllers.formats.leapp import read_leapp
-from sim.controllers.formats.legged_gym import read_legged_gym
-from sim.controllers.formats.mjlab import read_mjlab
 from sim.controllers.formats.network import load_network
 from sim.controllers.formats.onnx_data import read_metadata
-from sim.controllers.formats.rl_sar import read_rl_sar
+from sim.controllers.formats.onnx_metadata import read_holosoma, read_mjlab
 from sim.controllers.formats.source import Source
-from sim.controllers.formats.unitree_rl_gym import read_unitree_rl_gym
 from sim.controllers.formats.weights import read_weights_alone
 from sim.controllers.spec import data_file
 from sim.files.command import command_line

@@ -75,8 +75,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     _try_rows(policy, (robot.observation_size, robot.num_joints), device, str(spec), f"robot '{robot.name}'")
     if named.module is None and not _separates_rows(policy, robot.observation_size, device):
         what = "fails, or acts differently in an episode's first step, beside other rows or after other steps"
-        why = "it mixes rows, draws at random, or remembers across a reset"
-        raise ValueError(f"policy '{spec}' {what}: {why}: export it without that")
+        raise ValueError(f"policy '{spec}' {what}: export it without batches, chance or memory across a reset")
     if named.file is not None and multiprocessing.parent_process() is None:  # a worker's parent warns
         _warn_if_trained_otherwise(Path(named.file), robot)
     return policy
@@ -115,8 +114,7 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
     try:
         policy = target(*arguments.values())
     except Exception as error:
-        what = f"failed, called with ({', '.join(arguments)})"
-        raise ValueError(f"policy '{spec}' {what}: {in_one_line(error)}") from error
+        raise ValueError(f"policy '{spec}' failed on ({', '.join(arguments)}): {in_one_line(error)}") from error
     if not callable(policy):
         raise ValueError(f"policy '{spec}' must return a callable, got {type(policy).__name__}")
     return policy
@@ -178,16 +176,15 @@ def _load_encoded(policy: Described, weights: Path, path: Path, load: functools.
 @torch.inference_mode()
 def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, label: str) -> None:
     """Tries a controller of these observation and action sizes on four robots that begin an episode."""
-    shape = (4, sizes[0])
     try:
         reset_all(policy, 4, device)
-        action = policy(torch.zeros(shape, device=device))
+        action = policy(torch.zeros((4, sizes[0]), device=device))
     except (Exception, SystemExit) as error:  # a controller can fail with anything
         width = find_widths(policy)[0] if isinstance(policy, torch.nn.Module) else None
+        why = f"failed on rows of shape {(4, sizes[0])} of {label}: {in_one_line(error)}"
         if width not in (None, sizes[0]):
-            what = f"takes {width} columns, {label} gives {sizes[0]}"
-            raise ValueError(f"policy '{spec}' {what}: describe those that it takes (docs/controllers.md)") from error
-        raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of {label}: {in_one_line(error)}") from error
+            why = f"takes {width} columns, {label} gives {sizes[0]}: describe those that it takes (docs/controllers.md)"
+        raise ValueError(f"policy '{spec}' {why}") from error
     if problem := action_problem(action, (4, sizes[1])):
         raise ValueError(f"policy '{spec}' must return {sizes[1]} joints' actions for 4 robots, {problem}")
     if not torch.isfinite(action).all():
@@ -197,8 +194,7 @@ def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, label
 @torch.inference_mode()
 def _separates_rows(policy: Any, width: int, device: str) -> bool:
     """Whether a robot that begins an episode gets the same action beside any others, whatever steps came before."""
-    generator = torch.Generator().manual_seed(0)
-    first_actions: list[torch.Tensor] = []
+    first_actions, generator = [], torch.Generator().manual_seed(0)
     row = 3.0 * torch.randn(width, generator=generator)
     for count in (3, 40):
         steps = 3.0 * torch.randn((12, count, width), generator=generator)

@@ -94,6 +94,5 @@ def _read_constant(data: bytes, name: str) -> list[float]:
     feeds = [{port.name: rng.normal(size=port.shape).astype("f4") for port in session.get_inputs()} for _ in range(2)]
     first, second = (np.asarray(session.run([name], feed)[0]) for feed in feeds)
     if not np.array_equal(first, second):
-        got = "values that follow its inputs: they are not simulated"
-        raise ValueError(f"its output {name} must be constant, got {got}")
+        raise ValueError(f"its output {name} must be constant, got values that follow its inputs")
     return first.ravel().astype(float).round(6).tolist()

@@ -41,17 +41,14 @@ def load_network(
         except ValueError:
             raise
         except Exception as foreign:
-            what = "is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module"
-            why = f"(truncated, foreign, or holding code): {in_one_line(error)}"
-            remedy = "give one of these, or an ONNX file that ends in .onnx"
-            raise ValueError(f"policy '{path}' {what} {why}: {remedy}") from foreign
+            must = "must be an rsl_rl checkpoint of plain tensors, TorchScript, or ONNX that ends in .onnx"
+            raise ValueError(f"policy '{path}' {must}: {in_one_line(error)}") from foreign
         return module if sizes is None else _separate_robots(module, probe, path, sizes[0], device)
     policy = make_actor(content, path, activation)
     if sizes is not None and policy.sizes != sizes:
         what = f"maps {policy.sizes[0]} observations to {policy.sizes[1]} actions"
-        must = f"{label} has {sizes[0]} observations and {sizes[1]} joints"
-        remedy = "give one that fits, or describe it (docs/controllers.md)"
-        raise ValueError(f"policy '{path}' {what}, but {must}: {remedy}")
+        must = f"{label} has {sizes[0]} observations and {sizes[1]} joints: describe it (docs/controllers.md)"
+        raise ValueError(f"policy '{path}' {what}, but {must}")
     return policy.to(device).eval()
 
 
@@ -173,5 +170,4 @@ def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: st
                 together = torch.stack([recurrent(step) for step in rows], dim=1)
                 if torch.allclose(together, torch.stack(separate), rtol=1e-4, atol=1e-4):
                     return _RecurrentScript(module, initial, axis).to(device)
-    remedy = "give the checkpoint that it was made of"
-    raise ValueError(f"policy '{path}' remembers one robot alone, in {', '.join(initial)}: {remedy}")
+    raise ValueError(f"policy '{path}' remembers one robot alone, in {', '.join(initial)}: give its checkpoint")

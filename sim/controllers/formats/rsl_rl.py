@@ -99,8 +99,7 @@ def make_actor(content: Any, path: Path, activation: str | None) -> MlpPolicy | 
         if activation is None and (agent := agent_file(path)) is not None:
             activation = read_activation(read_yaml(agent))
         if activation is None:
-            described = 'describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
-            remedy = f"put the agent.yaml of its training beside it, or {described}"
+            remedy = 'put the agent.yaml of its training beside it, or write activation = "elu" into a controller.toml'
             raise ValueError(f"policy '{path}' does not say what is between its layers: {remedy}")
         if not isinstance(activation, str) or activation not in ACTIVATIONS:
             raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {activation}")

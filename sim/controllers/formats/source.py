@@ -26,8 +26,6 @@ TERM_NAMES = {name: term for term, names in _NAMES_BY_TERM.items() for name in n
 """Terms of the observation by the names that rl_sar and mjlab give them."""
 BLIND_TERMS = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
 """Terms of a controller without sight, in the usual order."""
-SETTINGS = ("default_joint_pos", "stiffness", "damping", "action_scale", "physics_dt", "decimation")
-"""Settings that most sources have, under names of their own."""
 
 
 @dataclass(kw_only=True)
@@ -65,10 +63,9 @@ class Source:
 
     def find_weights(self, name: str) -> Path:
         """The file of weights that the source names; its name may have a path of another machine."""
-        folder = self.file.parent
-        file = find_above(name, folder) or folder / Path(name).name
+        file = find_above(name, self.file.parent) or self.file.parent / Path(name).name
         if not file.is_file():
-            raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
+            raise ValueError(f"{file} is not there: put the weights that {self.file} names beside it")
         return file
 
     def set(self, reason: str = "", **settings: Any) -> None:
@@ -82,9 +79,8 @@ class Source:
 
     def refuse_unknown(self, names: Iterable[str], known: Iterable[str]) -> None:
         """Raises a ValueError with the names that are not known."""
-        if unknown := [str(name) for name in names if name not in known]:
-            what = f"{self.file} says what is not understood: {', '.join(unknown)}"
-            raise ValueError(f"{what}: take it out if it does not matter")
+        if unknown := ", ".join(str(name) for name in names if name not in known):
+            raise ValueError(f"{self.file} says what is not understood: {unknown}: take it out if it does not matter")
 
     def move(self, content: dict[str, Any], names: Mapping[str, str], joints: Sequence[str]) -> None:
         """Moves values from ``content`` to settings of other names; lists in the order of ``joints`` are reordered."""
