@@ -153,9 +153,9 @@ class Sensed:
     joint_pos: torch.Tensor  # joint angles [rad] in the order of ``robot.joint_names``, shape (num_envs, num_joints)
     joint_vel: torch.Tensor  # joint rates [rad/s], shape (num_envs, num_joints)
     last_action: torch.Tensor  # what the controller last returned, clipped to +-100; shape (num_envs, num_joints)
-    scan: torch.Tensor
-    """Height of the base over the ground at the scan points [m], clipped to -0.5..1.5; shape
-    (num_envs, len(scan_x), len(scan_y)): ``robot.scan_x`` ahead and ``robot.scan_y`` left of the base, yaw frame."""
+    # Height of the base over the ground at ``robot.scan_x`` ahead and ``robot.scan_y`` left of it, yaw frame [m],
+    # clipped to -0.5..1.5.
+    scan: torch.Tensor  # shape (num_envs, len(scan_x), len(scan_y))
     base_pos: torch.Tensor  # position of the base, world-local frame [m], shape (num_envs, 3)
     quat: torch.Tensor  # quaternion wxyz of the base, base to world frame, shape (num_envs, 4)
     contacts: torch.Tensor  # contact force on each of ``robot.foot_geoms`` [N], shape (num_envs, num_feet)
@@ -225,8 +225,8 @@ class Described(torch.nn.Module):
         self._moved = self._find_joints(cfg.joints)
         self._wandering = self._find_joints(cfg.wander.joints, "wander.joints") if cfg.wander else ()
         if taken := {*self._moved} & {*self._wandering, *self._find_joints(tuple(cfg.hold or ()), "hold")}:
-            names = ", ".join(robot.joint_names[k] for k in sorted(taken))
-            self._refuse(f"hold and wander must name joints that the network does not move, got {names}")
+            names = [robot.joint_names[k] for k in sorted(taken)]
+            self._refuse(f"hold and wander must name joints that the network does not move, got {', '.join(names)}")
         self.num_actions = len(self._moved)
         for name in ("default", "action_scale", "action_offset", "action_clip"):
             values = getattr(cfg, name)
@@ -241,11 +241,10 @@ class Described(torch.nn.Module):
             self._check_limits(f"observation[{k}].clip", term.clip)
             for limit in np.ravel(term.limit or 0.0):
                 self._check_limits(f"observation[{k}].limit", limit)
-        history = cfg.history
-        self.lengths = [term.history or (history.length if history else 1) for term in cfg.observation]
-        if max(self.lengths) > 1 and history is None:
+        self.lengths = [term.history or (cfg.history.length if cfg.history else 1) for term in cfg.observation]
+        if max(self.lengths) > 1 and cfg.history is None:
             self._refuse("history must say how steps are laid out: {length = 1, newest, by, fill}")
-        if history is not None and history.by == "row" and len(set(self.lengths)) > 1:
+        if cfg.history is not None and cfg.history.by == "row" and len(set(self.lengths)) > 1:
             self._refuse(f'history.by must be "term" where terms have other lengths, got {self.lengths}')
         self.observation_size = int(np.dot(self.widths, self.lengths))  # columns that the network sees
         terms = zip(cfg.observation, self.widths, self.lengths, strict=True)
@@ -300,12 +299,10 @@ class Described(torch.nn.Module):
         names = joints if names is None else names
         unknown = [name for name in names if name not in joints]
         if unknown or len(set(names)) < len(names):
-            got = f"no {', '.join(unknown)}" if unknown else "each of them once"
-            self._refuse(f"{setting} must be the robot's, which has {got}, only {', '.join(joints)}")
+            self._refuse(f"{setting} must be the robot's, each once, got {', '.join(unknown or names)}, not {joints}")
         return tuple(joints.index(name) for name in names)
 
     def _find_columns(self, term: Term) -> Sequence[int]:
-        """The columns of its quantity that a term takes."""
         robot = self.robot
         if "joints" in TERMS[term.term]:
             return self._moved if term.joints is None else self._find_joints(term.joints)

@@ -142,7 +142,7 @@ class PolicyRunner:
             action = self._policy(observation)
         except (Exception, SystemExit) as error:  # a controller can fail with anything
             name = getattr(self._policy, "__qualname__", type(self._policy).__qualname__)
-            what = f"failed in the middle of a crossing, on observations of shape {tuple(observation.shape)}"
+            what = f"failed in a crossing, on observations of shape {tuple(observation.shape)}"
             raise ValueError(f"controller {name} {what}: {in_one_line(error)}") from error
         if problem := action_problem(action, shape):
             raise ValueError(f"the controller must return actions of shape {shape}, {problem}, during a crossing")

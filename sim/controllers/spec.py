@@ -36,8 +36,7 @@ class ControllerSpec:
         return cls(file=str(spec)) if match is None else cls(**match.groupdict())
 
     def __str__(self) -> str:
-        code = self.module and f"{self.module}:{self.name}"
-        return "@".join(filter(None, (code, self.file)))
+        return "@".join(filter(None, (self.module and f"{self.module}:{self.name}", self.file)))
 
     @property
     def runs_code(self) -> bool:
@@ -61,10 +60,9 @@ class ControllerSpec:
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
         """The same with its files in another folder."""
-        module = self.module
-        if module is not None and module.endswith(".py"):
-            module = str(folder / Path(module).name)
-        return replace(self, module=module, file=self.file and str(folder / Path(self.file).name))
+        files = [name and str(folder / Path(name).name) for name in (self.module, self.file)]
+        is_file = self.module is not None and self.module.endswith(".py")
+        return replace(self, module=files[0] if is_file else self.module, file=files[1])
 
 
 def weights_file(path: Path, key: str = "policy") -> Path | None:
@@ -146,10 +144,8 @@ def run_file(path: Path) -> ModuleType:
         raise ValueError(f"{path}: no such file")
     path = path.resolve()
     name = f"faultline_file_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None:
-        raise ValueError(f"{path} is no Python file: expected a name that ends in .py")
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(name)
+    module.__file__ = str(path)
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # last: a neighbour must not stand in for an installed package
     importlib.invalidate_caches()

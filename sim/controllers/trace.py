@@ -94,7 +94,6 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
 
 
 def _compare(name: str, ours: torch.Tensor, theirs: torch.Tensor, labels: Sequence[str]) -> list[str]:
-    """A line about the first difference, if there is one."""
     differs = (ours - theirs).abs() > _TOLERANCE * theirs.abs().clamp(min=1.0)
     if not differs.any():
         return []

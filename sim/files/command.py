@@ -95,6 +95,8 @@ class EliteFlags(SpaceFlag):
 _EXTRAS = {"rsl_rl": "train", "tensordict": "train", "tensorboard": "train", "onnx": "onnx", "onnxruntime": "onnx"}
 """Extras of pyproject.toml by the modules of theirs that are imported; what searches and shows needs none."""
 BEGAN = time.monotonic()  # when the program began [s]
+Report = dict[str, Any]
+Draw = Callable[[Report], bytes]
 
 
 class UserError(Exception):
@@ -278,12 +280,8 @@ def choose_elites(text: str, numbers: Sequence[int], missing: str) -> list[int]:
 
 
 def publish(
-    out: Path | None,
-    measure: Callable[[], dict[str, Any]],
-    show: Callable[[dict[str, Any]], None],
-    *,
-    draw: Callable[[dict[str, Any]], bytes] | None = None,
-) -> dict[str, Any]:
+    out: Path | None, measure: Callable[[], Report], show: Callable[[Report], None], *, draw: Draw | None = None
+) -> Report:
     """Measures a report, shows it, writes it to the JSON ``out``, beside the PNG of ``draw``, and returns it."""
     writers: dict[Path, Callable[..., bytes]] = {} if out is None else {out: to_json}
     if out is not None and draw is not None:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+_Values = NDArray[np.floating]
+_Bounds = tuple[float, float]
 RATES = (0.0, 1.0)  # bounds of rates
 DIFFERENCES = (-1.0, 1.0)  # bounds of differences of rates
 _Z = 1.959963984540054  # the normal distribution's 97.5 % quantile
@@ -38,11 +40,7 @@ def resamples(count: int, seed: int, draws: int = _BOOTSTRAP_DRAWS) -> NDArray[n
 
 
 def bootstrap_interval(
-    values: NDArray[np.floating],
-    seed: int,
-    *,
-    families: NDArray[np.int64] | None = None,
-    bounds: tuple[float, float] | None = None,
+    values: _Values, seed: int, *, families: NDArray[np.int64] | None = None, bounds: _Bounds | None = None
 ) -> list[float] | None:
     """Interval of the mean of ``values`` (num_terrains,), resampling terrains; None of fewer than two families.
 
@@ -60,14 +58,11 @@ def bootstrap_interval(
     low, high = np.quantile(means, [tail, 1.0 - tail])
     if bounds is not None:
         lowest, highest = _bound_rare(values, family, count, bounds)
-        low = min(low, lowest)
-        high = max(high, highest)
+        low, high = min(low, lowest), max(high, highest)
     return [float(low), float(high)]
 
 
-def _bound_rare(
-    values: NDArray[np.floating], family: NDArray[np.int64], count: int, bounds: tuple[float, float]
-) -> tuple[float, float]:
+def _bound_rare(values: _Values, family: NDArray[np.int64], count: int, bounds: _Bounds) -> _Bounds:
     """How far the mean may lie if few of ``count`` families differ from 0, or 1; the mean itself if many do."""
     mean = float(values.mean())
     apart = values - (1.0 if bounds == RATES and mean > 0.5 else 0.0)

@@ -141,19 +141,15 @@ def drive_problems(spec: Any, model: Any) -> Iterator[str]:
     """What no position drive can do, with its line in the file."""
     driven = set[int]()
     for k, actuator in enumerate(spec.actuators):
-        line = f"on {actuator.target} ({actuator.info})"
-        joint = _driven_joint(model, k)
-        kind = _actuator_kind(model, k)
-        if joint < 0:
-            yield f"an actuator that moves no joint {line}"
-        elif kind not in ("position", "motor"):
-            yield f"{kind} {line}"
-        elif joint in driven:
-            yield f"a second actuator {line}"
-        elif joint in _followers(model):
-            yield f"a drive of a joint that follows another {line}"
-        elif kind == "position" and model.actuator_gear[k, 0] != 1.0:
-            yield f"a gear other than 1 on a position actuator {line}"
+        joint, kind = _driven_joint(model, k), _actuator_kind(model, k)
+        checks = {
+            "an actuator that moves no joint": joint < 0,
+            kind: kind not in ("position", "motor"),
+            "a second actuator": joint in driven,
+            "a drive of a joint that follows another": joint in _followers(model),
+            "a gear other than 1 on a position actuator": kind == "position" and model.actuator_gear[k, 0] != 1.0,
+        }
+        yield from [f"{what} on {actuator.target} ({actuator.info})" for what in checks if checks[what]][:1]
         driven.add(joint)
     for joint, name, (low, high), _ in _torque_ranges(model):
         if low != -high:
@@ -465,8 +461,7 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
         beyond = np.flatnonzero(~((low - _SLACK <= pose) & (pose <= high + _SLACK)))
         if len(beyond):
             listed = ", ".join(f"{names[k]} ({low[k]:g} to {high[k]:g}, got {pose[k]:g})" for k in beyond)
-            degrees = ": angles are in radians" if np.abs(pose).max() > 2.0 * np.pi else ""
-            problems.append(f"default_joint_pos is outside of the file's range for {listed}{degrees}")
+            problems.append(f"default_joint_pos is outside of the file's range for {listed}: angles are in radians")
     limitless = ", ".join(name for name, effort in zip(names, drives.effort, strict=True) if np.isinf(effort))
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
         problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")

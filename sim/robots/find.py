@@ -63,8 +63,8 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
         scales = msgspec.convert(content.get("scales"), dict[str, PositiveFloat])
         return tuple(scales[name] for name in robot.penalties)
     except (msgspec.ValidationError, KeyError) as error:
-        names = ", ".join(robot.penalties)
-        raise ValueError(f"{robot.scales_file} needs a positive scale for {names}: {error}; {remedy}") from None
+        needed = f"a positive scale for {', '.join(robot.penalties)}"
+        raise ValueError(f"{robot.scales_file} needs {needed}: {error}; {remedy}") from None
 
 
 def read_stray(robot: RobotCfg, *, resolved: bool = False) -> float:

@@ -110,7 +110,6 @@ def _vector(values: NDArray[np.float64]) -> Any:
 
 
 def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
-    """Adds a shape that touches the ground."""
     kind = mj.mjtGeom(int(model.geom_type[geom]))
     source, scale = None, model.geom_size[geom]
     if kind == mj.mjtGeom.mjGEOM_MESH:

@@ -100,7 +100,6 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
 
 
 def _urdf_files(root: ET.Element, model_file: Path) -> list[Path]:
-    """A URDF and its meshes, whose names become absolute."""
     if problems := [f"{model_file}: {problem}" for problem in _urdf_problems(root)]:
         raise ValueError("; ".join(problems))
     files = [model_file]

@@ -204,8 +204,8 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     if is_mesh:
         return hull_probes(vertices.tobytes())[0]
     if make_strips is None:
-        must = f"it must be a SPHERE, CAPSULE, BOX, CYLINDER or MESH, got {newton.GeoType(shape_type).name}"
-        raise ValueError(f"{must}: replace it in the robot's file")
+        kind = newton.GeoType(shape_type).name
+        raise ValueError(f"it must be a SPHERE, CAPSULE, BOX, CYLINDER or MESH, got {kind}: replace it in the file")
     return [*make_strips(*map(float, sizes))]
 
 

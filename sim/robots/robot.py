@@ -32,8 +32,7 @@ class ActuatorNetCfg:
     vel_scale: float = 1.0
     torque_scale: float = 1.0
     input_order: Literal["pos_vel", "vel_pos"] = "pos_vel"
-    input_idx: tuple[NonNegativeInt, ...] = ()
-    """Evaluations ago of which dense layers see error and velocity; if empty, the last ones, the newest first."""
+    input_idx: tuple[NonNegativeInt, ...] = ()  # evaluations ago that dense layers see; if empty the last ones
     decimation: PositiveInt = 1  # physics steps for which a torque is held
 
 
@@ -78,19 +77,15 @@ class RobotCfg:
     saturation_effort: tuple[PositiveFloat, ...] | None = None  # stall torque [N m]
     velocity_limit: tuple[PositiveFloat, ...] | None = None  # speed without torque [rad/s]
     actuator_net: ActuatorNetCfg | None = None  # network in place of PD gains; its torque is clipped as theirs is
-    drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
-    """Physics steps by which joint targets are late. Until the first one arrives, the default pose is held."""
-    friction: PositiveFloat | None = None
-    """Sliding friction of all geoms; the file's if None, 1 of a URDF. Less than the ground's .3 counts as .3."""
-    contact_time_constant_s: PositiveFloat | None = None
-    """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
+    drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0  # physics steps by which joint targets are late
+    friction: PositiveFloat | None = None  # of all geoms, sliding, at least .3; the file's if None, 1 of a URDF
+    contact_time_constant_s: PositiveFloat | None = None  # of all geoms [s]; the file's if None, .01 of a URDF
     training: TrainingCfg = field(default_factory=TrainingCfg)
     learning: LearningCfg = field(default_factory=LearningCfg)
     tuning: TuningCfg = field(default_factory=TuningCfg)
     label: str = ""  # name of a shipped robot as its makers write it
     paper: PaperCfg = field(default_factory=PaperCfg)  # what the paper did with a shipped robot
-    settings_file: Path | None = None
-    """File of a user's robot, TOML or Python, set by :func:`sim.robots.find.get_robot`; None of a shipped robot."""
+    settings_file: Path | None = None  # of a user's robot, TOML or Python, set by get_robot; None of a shipped robot
 
     @property
     def spec(self) -> str:
@@ -199,9 +194,8 @@ def check_robot_digest(record: Mapping[str, Any], robot: RobotCfg, file: Path, r
     """Refuses a file's record of the robot before it changed; ``remedy`` is what else helps."""
     expected, now = record.get("robot_sha256"), robot_digest(robot)
     if expected != now:
-        hashes = f"expected SHA-256 {str(expected)[:12]}, got {now[:12]} of {robot.spec}"
-        problem = f"as it was before its settings, model or meshes changed ({hashes})"
-        raise ValueError(f"{file} is of robot '{robot.name}' {problem}: put that back, or {remedy}")
+        was = f"as it was before its settings, model or meshes changed, of SHA-256 {str(expected)[:12]}, not {now[:12]}"
+        raise ValueError(f"{file} is of robot '{robot.name}' {was}: put that back, or {remedy}")
 
 
 def check_robot_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path, remedy: str) -> None:

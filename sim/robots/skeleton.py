@@ -61,8 +61,8 @@ def shown_spec(robot: RobotCfg) -> Any:
                 is_base = geom.name in robot.base_geoms
                 geom.rgba = _FOOT_COLOR if is_foot else _BASE_COLOR if is_base else _LIMB_COLOR
     if looks:
-        names = ", ".join(body.name for body in spec.bodies[1:])
-        raise ValueError(f"{look_file} has a body '{next(iter(looks))}': expected those of {robot.model_file}, {names}")
+        names = [body.name for body in spec.bodies[1:]]
+        raise ValueError(f"{look_file} must have the bodies of {robot.model_file}, {names}, got {[*looks]}")
     return spec
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.controllers.formats.isaac_lab import ISAAC_LAB_TERMS, read_action, read_term
+from sim.controllers.formats.isaac import ISAAC_LAB_TERMS, read_action, read_term
 from sim.controllers.formats.source import BLIND_TERMS, TERM_NAMES, Source, collapse, find_checkpoint, make_terms
 from sim.files.settings import read_yaml
 

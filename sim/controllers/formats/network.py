@@ -46,9 +46,9 @@ def load_network(
         return module if sizes is None else _separate_robots(module, probe, path, sizes[0], device)
     policy = make_actor(content, path, activation)
     if sizes is not None and policy.sizes != sizes:
-        what = f"maps {policy.sizes[0]} observations to {policy.sizes[1]} actions"
-        must = f"{label} has {sizes[0]} observations and {sizes[1]} joints: describe it (docs/controllers.md)"
-        raise ValueError(f"policy '{path}' {what}, but {must}")
+        (seen, moved), (width, count) = policy.sizes, sizes
+        must = f"{label} has {width} observations and {count} joints: describe it (docs/controllers.md)"
+        raise ValueError(f"policy '{path}' maps {seen} observations to {moved} actions, but {must}")
     return policy.to(device).eval()
 
 

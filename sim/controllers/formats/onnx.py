@@ -43,7 +43,7 @@ class _Ports:
         """Shape of one robot's input, and of its states, by their names; None where it is free."""
         self.states = {port.name: self._read_shape(port, (1, 0)) for port in inputs if port.name in pairs}
         if not rest or not self.columns or None in sum(self.states.values(), ()):
-            got = f"{', '.join(port.name for port in inputs)} and {', '.join(names)}"
+            got = [port.name for port in inputs], names
             raise ValueError(f"it must have an input and an output, and states X_in and X_out, got {got}")
         width = None if None in sum(self.columns.values(), ()) else sum(map(math.prod, self.columns.values()))
         count = self._read_shape(actions[0])[-1]
@@ -227,9 +227,8 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
         warnings.warn(f"policy '{path}' returns more than actions: {', '.join(ports.ignored)}: ignored", stacklevel=2)
     if isinstance(network, OnnxPolicy):
         if target.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
-            what = "runs on the CPU, since this onnxruntime has no CUDA that works"
-            remedy = "install onnxruntime-gpu, or give the rsl_rl checkpoint"
-            warnings.warn(f"policy '{path}' has more than plain layers and {what}: {remedy}", stacklevel=2)
+            what = "has more than plain layers and runs on the CPU: install onnxruntime-gpu, or give the checkpoint"
+            warnings.warn(f"policy '{path}' {what}", stacklevel=2)
         if network.ports.is_single:
             warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
     network = _OnnxRecurrent(network, ports) if ports.states else network
@@ -245,15 +244,13 @@ def _make_if_equal(make: Callable[[], Any], policy: OnnxPolicy) -> Any:
         for count, size in ((1, 0.1), (5, 1.0), (40, 3.0)):
             rows, *states = (size * torch.randn([count, *shape], generator=generator) for shape in shapes)
             for value, expected in zip(made.run(rows, states), policy.run(rows, states), strict=True):
-                largest = max(1.0, float(expected.abs().max()))
-                torch.testing.assert_close(value, expected, rtol=0.0, atol=1e-4 * largest)
+                torch.testing.assert_close(value, expected, rtol=0.0, atol=1e-4 * max(1.0, float(expected.abs().max())))
     except Exception:  # onnxruntime's errors have no base
         return None
     return made
 
 
 def _free_batch(model: Any, ports: _Ports) -> bytes:
-    """The graph for any number of robots."""
     axes = ports.axes | ports.outputs
     for port in (*model.graph.input, *model.graph.output):
         if port.name in axes:

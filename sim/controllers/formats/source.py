@@ -34,8 +34,7 @@ class Source:
 
     file: Path  # the file that errors name
     model_file: Path | None  # the robot's MJCF or URDF; None until it is known
-    settings: dict[str, Any] = field(default_factory=dict)
-    """Fields of robot.toml and controller.toml; None where the user has to fill one in."""
+    settings: dict[str, Any] = field(default_factory=dict)  # of robot.toml and controller.toml; None to be filled in
     reasons: dict[str, str] = field(default_factory=dict)  # why a setting is a guess, or what the user should fill in
 
     @cached_property
@@ -162,13 +161,6 @@ def make_terms(names: Iterable[str], scales: Mapping[str, Any], **fields: Mappin
     """Terms of the observation with their scales and fields; a clock has the period of rl_sar and unitree_rl_gym."""
     fields = {"clock": {"period_s": 0.8}} | fields
     return [make_term(name, scales.get(name), **fields.get(name, {})) for name in names]
-
-
-def read_scales(scales: Mapping[str, Any]) -> dict[str, Any]:
-    """Scales of terms by legged_gym's names, in which a command has those of velocities."""
-    names = {"lin_vel": "lin_vel", "ang_vel": "ang_vel", "joint_pos": "dof_pos", "joint_vel": "dof_vel"}
-    command = [scales["lin_vel"], scales["lin_vel"], scales["ang_vel"]]
-    return {"command": command} | {term: scales[name] for term, name in names.items()}
 
 
 def find_checkpoint(folder: Path, *exported: str) -> Path:
