@@ -27,15 +27,9 @@ TERMS: dict[str, tuple[str, ...]] = {
     "contacts": ("threshold",), "torques": ("joints",), "scan": ("order", "x", "y", "offset"),
 }  # fmt: skip
 """Fields of each term besides those of all terms; docs/controllers.md explains them."""
-ROW_SCALES: dict[str, Any] = {
-    "lin_vel": LIN_VEL_SCALE,
-    "ang_vel": ANG_VEL_SCALE,
-    "gravity": 1.0,
-    "command": (LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE),
-    "joint_pos": 1.0,
-    "joint_vel": JOINT_VEL_SCALE,
-    "last_action": 1.0,
-}
+ROW_SCALES: dict[str, Any] = {"lin_vel": LIN_VEL_SCALE, "ang_vel": ANG_VEL_SCALE, "gravity": 1.0}
+ROW_SCALES |= {"command": (LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE), "joint_pos": 1.0}
+ROW_SCALES |= {"joint_vel": JOINT_VEL_SCALE, "last_action": 1.0}
 """Scales of a robot's own row before its scan, by quantity, in the order of its columns."""
 _ORDERS = {"scan": "(x|y) fastest", "clock": "(sin|cos)( (sin|cos))?", "quat": "w x y z|x y z w"}
 _ORDERS["command"] = "(v_x|v_y|yaw_rate)( (v_x|v_y|yaw_rate))*"

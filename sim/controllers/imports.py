@@ -16,7 +16,7 @@ from sim.controllers.formats.onnx_data import read_metadata
 from sim.controllers.formats.source import BLIND_TERMS, Source, make_term, make_terms
 from sim.controllers.spec import data_file
 from sim.files.command import command_line
-from sim.files.settings import YAML_SUFFIXES, read_yaml, to_toml
+from sim.files.settings import read_yaml, to_toml
 from sim.robots.compiled import PER_JOINT
 from sim.robots.model_files import MENAGERIE, find_model, find_robot_of_scene
 from sim.robots.user import NEW_NAME, is_new_name
@@ -73,7 +73,7 @@ def _list_marks(path: Path) -> set[str]:
         file = next(filter(Path.is_file, files), path)
     if file.suffix == ".onnx":
         return {"weights", *read_metadata(file)}
-    if file.is_file() and file.suffix not in (*YAML_SUFFIXES, ".json"):
+    if file.is_file() and file.suffix not in (".yaml", ".yml", ".json"):
         return {"weights"}
     if not file.is_file() or file.name == "env.yaml":  # which is long
         return {file.relative_to(path).as_posix()}

@@ -24,8 +24,7 @@ from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg, robot_digest
 
 _EXPECTED = "expected a .toml, .pt, .ts or .onnx file, module:callable or module:adapter@file (docs/controllers.md)"
-PolicySpec = str | Path | Policy
-"""A controller as :func:`load_policy` takes it, or as a callable."""
+PolicySpec = str | Path | Policy  # a controller as :func:`load_policy` takes it, or as a callable
 _print_once = functools.cache(print)
 
 
@@ -49,10 +48,7 @@ class _TorchMemory:
 
 @contextmanager
 def on_stream(stream: torch.cuda.Stream | None) -> Iterator[None]:
-    """Let torch and Warp work on ``stream``, if any, while neither it nor the present one waits for the other.
-
-    Warp's arrays that are made meanwhile must not be used afterwards.
-    """
+    """Let torch and Warp work on ``stream``, if any, without waiting; Warp's arrays of that time are not for later."""
     if stream is None:
         yield
     else:

@@ -11,9 +11,8 @@ import warp as wp
 from sim.controllers.spec import in_one_line
 from sim.device import recording
 
+# Torch sums matrix products of fewer than 4 or 16 rows in another order; 16 to 4,096 give each row the same bits.
 _MIN_ROWS = 32
-"""Torch sums matrix products in another order for fewer than 4 or 16 rows, by processor. Batches of 16 to 4,096 rows
-give each row the same bits (measured with AVX2 and AVX-512)."""
 
 
 def with_rows_of_zeros(rows: torch.Tensor) -> torch.Tensor:
@@ -142,7 +141,7 @@ class PolicyRunner:
             action = self._policy(observation)
         except (Exception, SystemExit) as error:  # a controller can fail with anything
             name = getattr(self._policy, "__qualname__", type(self._policy).__qualname__)
-            what = f"failed in a crossing, on observations of shape {tuple(observation.shape)}"
+            what = f"failed in the middle of a crossing, on observations of shape {tuple(observation.shape)}"
             raise ValueError(f"controller {name} {what}: {in_one_line(error)}") from error
         if problem := action_problem(action, shape):
             raise ValueError(f"the controller must return actions of shape {shape}, {problem}, during a crossing")

@@ -55,8 +55,7 @@ class ControllerSpec:
         files = [Path(self.file)] if self.file is not None else []
         if self.file is not None and files[0].suffix == ".toml":
             files += filter(None, (weights_file(files[0], key) for key in ("policy", "encoder")))
-        beside = [find(file) for file in files for find in (agent_file, data_file)]
-        return (*code, *files, *filter(None, beside))
+        return (*code, *files, *filter(None, [find(file) for file in files for find in (agent_file, data_file)]))
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
         """The same with its files in another folder."""

@@ -73,13 +73,12 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
         quantities.append((log.get(name, torch.zeros(len(observation), width)) - zeros) * torch.tensor(scale))
     row = torch.cat(quantities, dim=1)
     rows = torch.nn.functional.pad(row, (0, robot.observation_size - row.shape[1])).split(1)
-    rebuilt: list[torch.Tensor] = []
-    answers: list[torch.Tensor] = []
+    rebuilt, answers = [], []
     reset_all(controller, 1)
-    for step, row in enumerate(rows):
+    for row, seen, done in zip(rows, observation.split(1), log.get("action", observation).split(1), strict=True):
         rebuilt.append(controller.observe(row))
-        answers.append(controller.network(observation[step : step + 1]).clone())
-        controller.act(log["action"][step : step + 1] if "action" in log else answers[-1])
+        answers.append(controller.network(seen).clone())
+        controller.act(done if "action" in log else answers[-1])
     labels = _label_columns(controller)
     names = [label.partition(" ")[0] for label in labels]
     if unknown := [name for name in names if not log.keys() >= {*_NEEDS.get(name, (name,))}]:

@@ -1,7 +1,6 @@
 """What all commands share: option groups, how a command starts and fails, how a result is published.
 
-A command is a frozen dataclass: its docstring is its help, its fields are its flags, ``execute`` does the work and
-imports what takes seconds to load.
+A command is a frozen dataclass: docstring and fields are its help and flags, ``execute`` imports what loads slowly.
 """
 
 import inspect
@@ -102,8 +101,7 @@ Draw = Callable[[Report], bytes]
 class UserError(Exception):
     """An error that a user can mend, where no built-in type fits; only its text is shown."""
 
-    status = 2
-    """Exit status."""
+    status = 2  # of the exit
 
 
 class Interrupted(KeyboardInterrupt):
@@ -245,10 +243,7 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 
 def command_line(name: str, **flags: object) -> str:
-    """A command as it is typed, ``faultline replay --run runs/x --elite 0``, with paths from the working folder.
-
-    None, False and empty lists are left out, True is a bare flag.
-    """
+    """A command as it is typed, with paths from here; None, False and empty lists are left out, True is a bare flag."""
     argv = ["faultline", name]
     for field, value in flags.items():
         flag = f"--{field.replace('_', '-')}"

@@ -26,8 +26,7 @@ _SOURCES = (".py", ".cu", ".toml", ".xml")
 def provenance(device: str, seed: int) -> dict[str, Any]:
     """Command (by :func:`without_machine`), commit, hash of the sources, device, versions, seed and date of a result.
 
-    ``dirty``: sources or scripts differ from the commit; None if git cannot tell. FAULTLINE_COMMIT, which may end in
-    -dirty, names the commit where there is no git.
+    ``dirty``: sources or scripts differ from the commit; None if unknown. FAULTLINE_COMMIT (-dirty) stands for git.
     """
     variable = os.environ.get("FAULTLINE_COMMIT", "")
     commit = variable.removesuffix("-dirty") or None
@@ -55,11 +54,11 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
 @cache
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on, as far as they are installed."""
-    found = {"python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            installed[name] = version(name)
+    return installed
 
 
 def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:

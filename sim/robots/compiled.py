@@ -1,17 +1,13 @@
-"""A robot's file as MuJoCo compiles it, and its drives: at most one actuator a joint, with the joint's name.
-
-Geoms touch the ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
-"""
+"""A robot's file as MuJoCo compiles it: at most one actuator a joint, with its name; geoms touch the ground alone."""
 
 import itertools
 import re
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -59,10 +55,7 @@ def joint_names(model: Any) -> tuple[str, ...]:
 
 @lru_cache(maxsize=8)
 def number_links(robot: RobotCfg) -> NDArray[np.int32]:
-    """Bodies by their numbers from ``-LINKS`` on the right over 0, the base, to ``LINKS``, shape (2 * LINKS + 1,).
-
-    Links in the middle count on both sides. A side's numbers are spread over its links, in the model's order.
-    """
+    """Bodies by number from ``-LINKS``, on the right, over 0, the base, to ``LINKS``, spread over each side's links."""
     model = robot_spec(robot).compile()
     data = mj.MjData(model)
     data.qpos[3:7] = 1.0, 0.0, 0.0, 0.0
@@ -110,8 +103,7 @@ def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix.reshape(3, 3)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drives:
+class Drives(NamedTuple):
     """Position drives of a robot's joints; arrays have a row a joint."""
 
     stiffness: NDArray[np.float64]  # position gain [N m/rad]; 0 without a position actuator
@@ -221,8 +213,7 @@ def set_drives(spec: Any, drives: Drives, robot: RobotCfg) -> None:
         actuator.ctrlrange = np.nan_to_num(drives.targets[k])
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotFile:
+class RobotFile(NamedTuple):
     """Content of a robot's file, without its settings."""
 
     spec: Any  # the ``MjSpec``, stripped to what simulations use; every touching geom has a name
@@ -232,10 +223,7 @@ class RobotFile:
 
 
 def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
-    """The robot as an ``MjSpec`` that compiles, the settings before its file; an error says all that is wrong.
-
-    With ``visuals`` a URDF keeps what it shows.
-    """
+    """The robot as an ``MjSpec`` that compiles, or all that is wrong; with ``visuals`` a URDF keeps what it shows."""
     robot_file = read_robot_file(robot.model_file, visuals=visuals)
     if problems := file_problems(robot, robot_file):
         raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
@@ -432,20 +420,18 @@ def _structure_problems(model: Any) -> Iterator[str]:
             yield f"inertia of body {model.body(k).name} is that of a point: give it that of a body [kg m^2]"
 
 
-def _missing(kind: str, names: Sequence[str], present: Sequence[str], robot: RobotCfg) -> list[str]:
-    missing = ", ".join(name for name in names if name not in present)
-    return [f"no {kind} named {missing} in {robot.model_file}: the file has {', '.join(present)}"] if missing else []
-
-
 def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     """Complaints about settings that do not fit the robot's file: names, and values for each joint."""
     model, drives, names = file.model, read_drives(file.model), robot.joint_names
     geoms = [geom.name for geom in touching_geoms(*file.spec.bodies)]
-    no_geom = _missing("geom that touches the ground is", robot.geom_names, geoms, robot)
+    kinds = {"joint": (names, joint_names(model)), "geom that touches the ground": (robot.geom_names, geoms)}
+    unknown = []
+    for kind, (given, present) in kinds.items():
+        if missing := ", ".join(name for name in given if name not in present):
+            unknown.append(f"no {kind} is named {missing} in {robot.model_file}: the file has {', '.join(present)}")
     if names != joint_names(model):
-        no_joint = _missing("joint is", names, joint_names(model), robot)
         order = f"joint_names must follow the file's order {joint_names(model)}, got {names}"
-        return [*(no_joint or [order]), *no_geom]
+        return unknown if {*names} - {*joint_names(model)} else [order, *unknown]
     problems = []
     for field in PER_JOINT:
         values = getattr(robot, field)
@@ -469,4 +455,4 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     limp = ", ".join(names[k] for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers))
     if limp and not problems and robot.actuator_net is None:
         problems.append(f"no gains for {limp}: give stiffness and damping, or <position> in {robot.model_file}")
-    return [*problems, *no_geom]
+    return [*problems, *unknown]

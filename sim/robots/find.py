@@ -12,15 +12,11 @@ from sim.files.command import command_line
 from sim.files.settings import PositiveFloat
 from sim.robots.robot import ROBOTS, RobotCfg, check_robot_identity
 
-STRAY = {False: "stray_m", True: "stray_resolved_m"}
-"""Keys of penalty scales, by whether contact is resolved: how far a route may be missed [m]."""
+STRAY = {False: "stray_m", True: "stray_resolved_m"}  # keys of scales: how far a route may be missed [m]
 
 
 def get_robot(spec: str | RobotCfg | None) -> RobotCfg:
-    """The robot that the command line names: a shipped one, or the file of another, TOML or Python, which is run.
-
-    None is ANYmal; settings are returned as they are. :func:`resolve_robot` is for what a file names.
-    """
+    """The robot that the command line names: a shipped one, ANYmal for None, or a file, of which Python is run."""
     if isinstance(spec, RobotCfg):
         return spec
     spec = spec or "anymal"
@@ -35,10 +31,7 @@ def get_robot(spec: str | RobotCfg | None) -> RobotCfg:
 
 
 def resolve_robot(record: Mapping[str, Any], given: str | RobotCfg | None, file: Path, kind: str = "run") -> RobotCfg:
-    """The robot that a file's record names, if it has not changed since; errors name the file and its ``kind``.
-
-    A robot that is not shipped must be ``given`` by the command line too: no code runs that only a file names.
-    """
+    """The robot of a file's record, if unchanged; one that is not shipped must be ``given``: a record runs no code."""
     name = record["robot"]
     if given is None and name not in ROBOTS:
         raise ValueError(f"{file} is of robot '{name}', which is not shipped: name its settings file too, by --robot")
@@ -63,8 +56,8 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
         scales = msgspec.convert(content.get("scales"), dict[str, PositiveFloat])
         return tuple(scales[name] for name in robot.penalties)
     except (msgspec.ValidationError, KeyError) as error:
-        needed = f"a positive scale for {', '.join(robot.penalties)}"
-        raise ValueError(f"{robot.scales_file} needs {needed}: {error}; {remedy}") from None
+        names = ", ".join(robot.penalties)
+        raise ValueError(f"{robot.scales_file} needs a positive scale for {names}: {error}; {remedy}") from None
 
 
 def read_stray(robot: RobotCfg, *, resolved: bool = False) -> float:

@@ -5,17 +5,15 @@ import os
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 _PACKAGE = "package://"
 MENAGERIE = "menagerie:"  # what a model of MuJoCo Menagerie begins with
 _SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf", ".png")  # .msh: MuJoCo's own
 
 
-@dataclass(frozen=True, kw_only=True)
-class ModelFiles:
+class ModelFiles(NamedTuple):
     """A model file, read but not built."""
 
     root: ET.Element  # root of the XML; in a URDF the meshes' file names are absolute
@@ -28,10 +26,7 @@ class ModelFiles:
 
 
 def find_model(name: str | Path, folder: Path = Path()) -> Path:
-    """The file of a model: a path below ``folder``, or ``menagerie:unitree_go2``, which its package downloads.
-
-    ``menagerie:unitree_go2/go2_mjx`` is another of that robot's models.
-    """
+    """The file of a model: a path below ``folder``, ``menagerie:unitree_go2``, or ``menagerie:unitree_go2/go2_mjx``."""
     robot_name, _, model_name = str(name).removeprefix(MENAGERIE).partition("/")
     if not str(name).startswith(MENAGERIE):
         return folder / name
@@ -75,10 +70,7 @@ def _parse_xml(model_file: Path) -> ET.Element:
 
 
 def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
-    """Reads an MJCF or URDF and looks for the files that it names.
-
-    With ``visuals`` a URDF keeps the visuals of its links that are primitives or existing meshes of a known format.
-    """
+    """Reads an MJCF or URDF and looks for the files that it names; with ``visuals`` a URDF keeps those it can show."""
     root = _parse_xml(model_file)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")

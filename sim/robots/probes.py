@@ -2,9 +2,8 @@
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import newton
 import numpy as np
@@ -23,8 +22,7 @@ _BUNDLE = 8  # strips, few enough that one thread looks at all
 _vec3: Any = wp.vec3
 
 
-@dataclass(frozen=True, kw_only=True)
-class Strip:
+class Strip(NamedTuple):
     """A row of equal spheres on one shape, straight except on meshes."""
 
     centres: np.ndarray  # centres in the shape's frame [m], shape (num_probes, 3), in order along the strip
@@ -107,10 +105,7 @@ def _rows(centres: _Array, radii: _Array, corners: _Array) -> Iterator[Strip]:
 
 @lru_cache(maxsize=64)
 def hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
-    """Probes in the convex hull of vertices [m], float64 of shape (num_vertices, 3), and their tolerance [m].
-
-    Every point of the hull's surface lies at most the tolerance outside of the nearest probe.
-    """
+    """Probes in the convex hull of vertices [m], float64 (num_vertices, 3), and how far outside its surface lies."""
     try:
         hull = ConvexHull(np.frombuffer(vertices).reshape(-1, 3))
     except QhullError:

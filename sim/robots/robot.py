@@ -16,8 +16,7 @@ from sim.robots.model_files import read_model_files
 from sim.robots.training import LearningCfg, PaperCfg, TrainingCfg, TuningCfg
 
 _ROBOTS_DIR = Path(__file__).parent  # of the files of the shipped robots
-PENALTY_DEFINITION = "squared"
-"""How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
+PENALTY_DEFINITION = "squared"  # how yaw_rate, vel_x and vel_y measure an error; records by another are not read
 SENSES = {"pose": ("heading", "yaw", "quat", "base_pos"), "contacts": ("contacts",), "torques": ("torques",)}
 """What a robot may sense beside the usual row, and terms of a controller's observation that need it."""
 _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning", "label", "paper")
@@ -38,10 +37,7 @@ class ActuatorNetCfg:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotCfg:
-    """What the simulation and the search need to know of a robot beside its model file.
-
-    Base frame: x forward, y left, z up. The drives of the shipped robots stand in their MJCF, for any MuJoCo.
-    """
+    """What simulation, search and training need to know of a robot beside its model; x forward, y left, z up."""
 
     name: str  # name of its files and folders
     model_file: Path  # MJCF, whose first body has the free joint, or URDF; relative to the settings' file
@@ -169,13 +165,10 @@ def needed_senses(terms: Iterable[str]) -> list[str]:
 
 
 def robot_digest(robot: RobotCfg) -> str:
-    """SHA-256 of a robot: its model, its meshes, and its settings but those of training and those at their default.
-
-    So a new setting changes no hash; the default of an old one must stay.
-    """
+    """SHA-256 of a robot: its model, its meshes, and its settings but those of training and those at their default."""
     defaults = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(robot)}
     counted = {name: value for name, value in vars(robot).items() if name not in _NOT_IN_DIGEST}
-    settings = {name: value for name, value in counted.items() if value != defaults[name]}
+    settings = {name: value for name, value in counted.items() if value != defaults[name]}  # so defaults must stay
     if robot.actuator_net is not None:
         net = robot.actuator_net.file
         settings["actuator_net"] = asdict(robot.actuator_net) | {"file": hashlib.sha256(net.read_bytes()).hexdigest()}
@@ -208,5 +201,4 @@ def check_robot_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path,
 ROBOTS = {
     name: from_builtins(RobotCfg, {"name": name, "model_file": str(_ROBOTS_DIR / f"{name}.xml"), **settings}, name)
     for name, settings in read_toml(_ROBOTS_DIR / "shipped.toml").items()
-}
-"""The shipped robots by their names."""
+}  # the shipped ones

@@ -31,10 +31,7 @@ _NO_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, of a geom that names none
 
 
 def shown_spec(robot: RobotCfg) -> Any:
-    """An ``MjSpec`` to look at, with the joints and shapes that the simulation names.
-
-    A body shows its shapes of ``<model>.look.xml``, else those of the model that touch nothing, else all.
-    """
+    """An ``MjSpec`` to look at: bodies show shapes of ``<model>.look.xml``, else those that touch nothing, else all."""
     try:
         spec = robot_spec(robot, visuals=True)
     except ValueError:  # for example a visual mesh of too many faces
@@ -104,8 +101,7 @@ class Skeleton:
     """A robot's bodies without the world."""
 
     def __init__(self, robot: RobotCfg) -> None:
-        self.model: Any = robot_model(shown_spec(robot), robot)
-        """The ``MjModel``, whose body 0 is the world."""
+        self.model: Any = robot_model(shown_spec(robot), robot)  # the ``MjModel``, whose body 0 is the world
         self.num_bodies: int = self.model.nbody - 1
         self.touches = find_touches(self.model, robot)
 
@@ -125,10 +121,7 @@ class Skeleton:
         return shape.apply_transform(transform), color[:3].astype(np.float64)
 
     def body_poses(self, qpos: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Origins of the bodies in the world [m], shape (num_frames, num_bodies, 3), and their quaternions w x y z.
-
-        They are of MuJoCo's joint coordinates, shape (num_frames, nq), as of a recording.
-        """
+        """Origins [m] and quaternions w x y z of the bodies, (num_frames, num_bodies, 3 or 4), of MuJoCo's ``qpos``."""
         data = mj.MjData(self.model)
         poses = np.empty((len(qpos), self.num_bodies, 7))
         for frame, row in enumerate(qpos):

@@ -23,13 +23,10 @@ class NoiseCfg:
     scan: NonNegativeFloat = 0.1
 
     def column_widths(self, sizes: Sequence[int]) -> NDArray[np.float64]:
-        """Half width of each column of an observation whose quantities have the sizes of ``robot.column_sizes``.
-
-        A small turn by a is half of a in a quaternion.
-        """
+        """Half width of each column of an observation whose quantities have the sizes of ``robot.column_sizes``."""
         widths = [2.0 * self.lin_vel, 0.25 * self.ang_vel, self.gravity, 0.0, 0.0]
         widths += [self.joint_pos, 0.05 * self.joint_vel, 0.0, 5.0 * self.scan, 0.0, 0.5 * self.gravity, 0.0, 0.0]
-        return np.repeat(widths, sizes)
+        return np.repeat(widths, sizes)  # a small turn by a is half of a in a quaternion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,10 +87,8 @@ class LearningCfg(PaceCfg):
     iterations: PositiveInt = 2240
 
 
-Draw = Literal["uniform", "failing", "learnable"]
-"""How a fine-tuning draws elites (:class:`train.cfg.RecipeCfg`)."""
-MAX_SPREAD = 10.0
-"""How far along the way a training's robots may start [m]; farther ones would start within 2 m of the goal."""
+Draw = Literal["uniform", "failing", "learnable"]  # how a fine-tuning draws elites (:class:`train.cfg.RecipeCfg`)
+MAX_SPREAD = 10.0  # how far along the way robots may start [m]; farther ones would start within 2 m of the goal
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,8 +24,7 @@ from sim.robots.robot import ROBOTS, RobotCfg, needed_senses
 
 _ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
 _NAMES = (*_ROLES, "joint_names", "arm_joints", "penalties", "senses")
-NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
-"""What a robot may be called, since files and folders are called after it."""
+NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"  # of files and folders, too
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
 _MAX_SPEED = 300.0  # light legs get faster than 100 rad/s in falls, and where they shake [rad/s]
 
@@ -106,10 +105,7 @@ def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = Fa
 
 
 def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> dict[str, Any]:
-    """Settings of a robot.toml with those that it leaves out, from its model and a controller.toml beside it.
-
-    docs/robots.md says how each is inferred. ``given`` has one value a joint where a setting is of joints.
-    """
+    """Settings of a robot.toml with those that it leaves out, as docs/robots.md says; ``given`` has lists a joint."""
     from sim.robots.model import make_builder
     from sim.robots.probes import measure_extents
 
@@ -169,8 +165,8 @@ def describe_inferred(robot: RobotCfg) -> str:
 def write_setting(file: Path, name: str, value: Any, reason: str = "") -> None:
     """Writes a setting to the top of a robot.toml, with the reason as a comment, in place of a line of its name."""
     text = re.sub(rf"^{name}\s*=.*\n?", "", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    line = f"{name} = {to_toml(value)}" + (f"  # {reason}" if reason else "")
-    write_atomically(file, f"{line}\n{text}".encode())
+    comment = f"  # {reason}" if reason else ""
+    write_atomically(file, f"{name} = {to_toml(value)}{comment}\n{text}".encode())
 
 
 def settings_problems(robot: RobotCfg) -> Iterator[str]:

@@ -64,8 +64,7 @@ def read_deploy_yaml(path: Path, source: Source) -> Path:
     reason = "the order in which the motors of a limb follow each other; joints are numbered, not named"
     read_action(actions, joints, reason, source)
     source.set(joints=source.settings.get("joints", joints), reason=reason)
-    terms = content.pop("observations")
-    commands = content.pop("commands")
+    terms, commands = content.pop("observations"), content.pop("commands")
     by = "row" if terms.pop("use_gym_history", False) else "term"
     source.refuse_unknown([*content, *terms], _FUNCTIONS)
     rows = []

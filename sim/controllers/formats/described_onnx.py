@@ -30,19 +30,11 @@ _T1_POSE |= {"Left_Shoulder_Roll": -1.35, "Right_Shoulder_Roll": 1.35, "Left_Elb
 _ROBOTS = {
     "left_hip_pitch_joint": (_G1_POSE, {"base_ang_vel": {"scale": 0.25}, "dof_vel": {"scale": 0.05}}),
     "AAHead_yaw": (_T1_POSE, {"base_ang_vel": {}, "dof_vel": {"scale": 0.1}}),
-}
-"""Default pose [rad] and terms with scales of holosoma_inference's G1 and T1, by a joint that only that robot has."""
+}  # default pose [rad] and terms with scales of holosoma_inference's G1 and T1, by a joint that only that robot has
 _GAIN_BY_ARMATURE = (20.0 * math.pi) ** 2  # of G1, whose joints swing at 10 Hz
-_PORTS = {
-    "state/body/rotation": "quat",
-    "state/body/position": "base_pos",
-    "state/body/linear_velocity": "lin_vel",
-    "state/body/angular_velocity": "ang_vel",
-    "state/joint/position": "joint_pos",
-    "state/joint/velocity": "joint_vel",
-    "command/body/velocity": "command",
-    "velocity_command": "command",
-}
+_PORTS = {"state/body/rotation": "quat", "state/body/position": "base_pos", "state/joint/position": "joint_pos"}
+_PORTS |= {"state/body/linear_velocity": "lin_vel", "state/body/angular_velocity": "ang_vel"}
+_PORTS |= {"state/joint/velocity": "joint_vel", "command/body/velocity": "command", "velocity_command": "command"}
 _TARGET = "target/joint/position"
 _GAINS = {"kp": "stiffness", "kd": "damping"}
 

@@ -34,8 +34,7 @@ def read_isaac_lab(path: Path, source: Source) -> Path:
     agent = read_yaml(agent_file) if agent_file.is_file() else {}
     articulation = env["scene"]["robot"]
     source.find_model_file((articulation.get("spawn") or {}).get("asset_path"))
-    pose = articulation["init_state"]["joint_pos"]
-    pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
+    pose = per_joint(articulation["init_state"]["joint_pos"], source.joints, f"{source.file}: joint_pos", partly=True)
     source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
     _read_actuators(articulation["actuators"], source)
     source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
@@ -43,10 +42,9 @@ def read_isaac_lab(path: Path, source: Source) -> Path:
         source.set_speed((command.get("ranges") or {}) if isinstance(command, dict) else {})
     joint_order, reason = _order_joints(env, path, source)
     read_action(env["actions"], joint_order, reason, source, limit=agent.get("clip_actions"))
-    observation_groups = agent.get("obs_groups") or {}
+    groups = agent.get("obs_groups") or {}
     rows, lengths = [], []
-    for group_name in observation_groups.get("actor") or observation_groups.get("policy") or ["policy"]:
-        group = env["observations"][group_name]
+    for group in map(env["observations"].__getitem__, groups.get("actor") or groups.get("policy") or ["policy"]):
         terms = {name: term for name, term in group.items() if isinstance(term, dict)}
         common = group.get("history_length")
         lengths += [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
@@ -114,8 +112,8 @@ def _order_joints(env: dict[str, Any], path: Path, source: Source) -> tuple[list
     """All joints in the order of the simulation, with the reason if env.yaml does not say it."""
     if descriptors := sorted(path.rglob("*IO_descriptors.yaml")):
         return read_yaml(descriptors[0])["articulations"]["robot"]["joint_names"], ""
-    is_newton = "newton" in str(env["sim"].get("physics")).lower()
-    ordering = env["scene"]["robot"].get("joint_ordering") or ("mjwarp" if is_newton else "physx")
+    usual = "mjwarp" if "newton" in str(env["sim"].get("physics")).lower() else "physx"
+    ordering = env["scene"]["robot"].get("joint_ordering") or usual
     if isinstance(ordering, list):
         return ordering, ""
     if ordering not in ("physx", "mjwarp"):

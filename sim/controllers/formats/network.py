@@ -151,8 +151,7 @@ def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: st
         return _Script(module)
     first, second = map(_take_actions, outputs)
     if first is not outputs[0]:
-        what = f"returns {len(outputs[0])} values: the first are taken for actions, the others are ignored"
-        warnings.warn(f"policy '{path}' {what}", stacklevel=2)
+        warnings.warn(f"policy '{path}' returns {len(outputs[0])} values: all but the first are ignored", stacklevel=2)
     after = _read_tensors(probe)
     initial = {name: value for name, value in before.items() if not torch.equal(value, after[name])}
     if not isinstance(first, torch.Tensor) or not initial:

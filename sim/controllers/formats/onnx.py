@@ -54,8 +54,7 @@ class _Ports:
             raise ValueError(f"expected {self.sizes[0]} observations and {self.sizes[1]} actions, got {(width, count)}")
         if width is None:
             self.columns = dict.fromkeys(self.columns, (self.sizes[0],))
-        self.outputs = {actions[0].name: 0} | {pairs[name]: self.axes[name] for name in self.states}
-        """Axis of robots of each output that is needed."""
+        self.outputs = {actions[0].name: 0} | {pairs[name]: self.axes[name] for name in self.states}  # and their axes
         self.ignored = [name for name in names if name not in self.outputs]
 
     def _read_shape(self, port: Any, axes: Sequence[int] = (0,)) -> tuple[Any, ...]:
@@ -64,8 +63,8 @@ class _Ports:
         axes = sorted(axes, key=lambda axis: shape[axis : axis + 1] != [None])
         axis = next((axis for axis in axes if shape[axis : axis + 1] in ([None], [1])), None)
         if port.type != "tensor(float)" or len(shape) < 2 or axis is None:
-            must = "float32 of shape (batch, size) with a batch that is free or 1"
-            raise ValueError(f"'{port.name}' must be {must}, got {port.type} of shape {port.shape}")
+            got = f"{port.type} of shape {port.shape}"
+            raise ValueError(f"'{port.name}' must be float32 of shape (batch, size), its batch free or 1, got {got}")
         self.is_single |= shape[axis] == 1
         self.axes[port.name] = axis
         return (*shape[:axis], *shape[axis + 1 :])
@@ -205,9 +204,8 @@ _LAYERS: dict[str, Callable[..., Any]] = {
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
     """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
 
-    Its inputs are columns of the observation in their order, and the states that it returned; its outputs actions, and
-    states called X_out for the inputs X or X_in. A graph of plain layers becomes a torch module, another one for one
-    robot a graph for any number, if that acts as before on random rows; else it runs once a robot.
+    Inputs are columns of the observation, and states X or X_in; outputs are actions, and states X_out. Plain layers
+    become a torch module, another graph for one robot one for any number, if that acts as before on random rows.
     """
     target = torch.device(device)
     try:
@@ -260,10 +258,7 @@ def _free_batch(model: Any, ports: _Ports) -> bytes:
 
 
 def export_onnx(policy: MlpPolicy, path: Path) -> None:
-    """Writes a policy as one .onnx file: ``observation`` (batch, observation_size) to ``action`` (batch, num_joints).
-
-    Both are float32, the batch is free. The same policy gives the same bytes.
-    """
+    """Writes a policy, from ``observation`` to ``action``, with a free batch, as one .onnx of always the same bytes."""
     if path.suffix.lower() != ".onnx":
         raise ValueError(f"'{path}' must end in .onnx, by which controllers of that kind are known")
     if policy.activation not in _OPERATORS:
