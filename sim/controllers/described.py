@@ -27,15 +27,9 @@ TERMS: dict[str, tuple[str, ...]] = {
     "contacts": ("threshold",), "torques": ("joints",), "scan": ("order", "x", "y", "offset"),
 }  # fmt: skip
 """Fields of each term besides those of all terms; docs/controllers.md explains them."""
-ROW_SCALES: dict[str, Any] = {
-    "lin_vel": LIN_VEL_SCALE,
-    "ang_vel": ANG_VEL_SCALE,
-    "gravity": 1.0,
-    "command": (LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE),
-    "joint_pos": 1.0,
-    "joint_vel": JOINT_VEL_SCALE,
-    "last_action": 1.0,
-}
+ROW_SCALES: dict[str, Any] = {"lin_vel": LIN_VEL_SCALE, "ang_vel": ANG_VEL_SCALE, "gravity": 1.0}
+ROW_SCALES |= {"command": (LIN_VEL_SCALE, LIN_VEL_SCALE, ANG_VEL_SCALE), "joint_pos": 1.0}
+ROW_SCALES |= {"joint_vel": JOINT_VEL_SCALE, "last_action": 1.0}
 """Scales of a robot's own row before its scan, by quantity, in the order of its columns."""
 _ORDERS = {"scan": "(x|y) fastest", "clock": "(sin|cos)( (sin|cos))?", "quat": "w x y z|x y z w"}
 _ORDERS["command"] = "(v_x|v_y|yaw_rate)( (v_x|v_y|yaw_rate))*"
@@ -48,49 +42,31 @@ _COLUMNS = {"roll": 0, "pitch": 1, "yaw": 2, "w": 0, "x": 1, "y": 2, "z": 3, "v_
 class Term:
     """Columns of the observation: limited, then scaled, then remembered."""
 
-    term: str
-    """Which of :data:`TERMS`."""
-    clip: float | tuple[float, float] | None = None
-    """Largest size, or limits, in the quantity's unit, before ``scale``."""
-    scale: float | tuple[float, ...] = 1.0
-    """One factor, or one a column."""
-    history: Annotated[int, Meta(ge=1, le=10_000)] | None = None
-    """Number of control steps that the controller sees; as :class:`History` has it if None."""
-    at: tuple[float, float, float] | None = None
-    """Where the velocity is measured, for example by the IMU, base frame [m]; at the base link's origin if None."""
-    limit: float | tuple[float, float, float] | None = None
-    """Largest size of each command."""
-    joints: tuple[str, ...] | None = None
-    """Joints in this order; those that the controller moves if None."""
-    period_s: PositiveFloat | None = None
-    """Period of a clock [s]."""
-    order: str | None = None
-    """Of a scan "x fastest", of a quaternion "w x y z", of a clock "sin cos", of a command "v_x v_y yaw_rate", ..."""
-    x: tuple[float, ...] | None = None
-    """Points of a scan ahead of the base, yaw frame [m]; the robot's ``scan_x`` if None."""
-    y: tuple[float, ...] | None = None
-    """Left of it [m]; the robot's ``scan_y`` if None."""
-    offset: float | tuple[float, ...] | None = None
-    """Subtracted from the height over the ground [m] or from angles [rad]; of a clock: of each foot, in periods."""
-    value: float | tuple[float, ...] | None = None
-    """Numbers that never change."""
-    axes: Annotated[str, Meta(pattern="^(roll|pitch|yaw)( (roll|pitch|yaw))*$")] | None = None
-    """Angles of the base that are seen, in their order."""
-    threshold: PositiveFloat | None = None
-    """A foot with a larger force [N] is 1, else 0; the force itself if None."""
+    term: str  # which of :data:`TERMS`
+    clip: float | tuple[float, float] | None = None  # largest size, or limits, in the quantity's unit, before ``scale``
+    scale: float | tuple[float, ...] = 1.0  # one factor, or one a column
+    history: Annotated[int, Meta(ge=1, le=10_000)] | None = None  # control steps seen; :class:`History`'s if None
+    at: tuple[float, float, float] | None = None  # where the velocity is measured, base frame [m]; the origin if None
+    limit: float | tuple[float, float, float] | None = None  # largest size of each command
+    joints: tuple[str, ...] | None = None  # joints in this order; those that the controller moves if None
+    period_s: PositiveFloat | None = None  # period of a clock [s]
+    order: str | None = None  # "x fastest", "w x y z", "sin cos", "v_x v_y yaw_rate", ...
+    x: tuple[float, ...] | None = None  # points of a scan ahead of the base, yaw frame [m]; ``scan_x`` if None
+    y: tuple[float, ...] | None = None  # points left of the base [m]; ``scan_y`` if None
+    offset: float | tuple[float, ...] | None = None  # subtracted from heights [m], angles [rad]; of a clock, in periods
+    value: float | tuple[float, ...] | None = None  # numbers that never change
+    axes: Annotated[str, Meta(pattern="^(roll|pitch|yaw)( (roll|pitch|yaw))*$")] | None = None  # angles of the base
+    threshold: PositiveFloat | None = None  # a foot with a larger force [N] is 1, else 0; the force itself if None
 
 
 @dataclass(frozen=True, kw_only=True)
 class History:
     """How observations of former control steps are laid out."""
 
-    length: Annotated[int, Meta(ge=1, le=10_000)]
-    """Control steps that the controller sees, with the present one."""
+    length: Annotated[int, Meta(ge=1, le=10_000)]  # control steps that the controller sees, with the present one
     newest: Annotated[str, Meta(pattern="^(first|last)$")]
-    by: Annotated[str, Meta(pattern="^(row|term)$")]
-    """Whole rows one after the other, or all steps of a term before the next."""
-    fill: Annotated[str, Meta(pattern="^(zeros|first)$")]
-    """What stands for steps before the episode: zeros, or its first observation."""
+    by: Annotated[str, Meta(pattern="^(row|term)$")]  # row after row, or all steps of a term before the next
+    fill: Annotated[str, Meta(pattern="^(zeros|first)$")]  # for steps before the episode: 0, or its first observation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,32 +82,19 @@ class Wander:
 class ControllerCfg:
     """What a ``controller.toml`` says."""
 
-    policy: str
-    """File of the weights, beside it: TorchScript, ONNX, or an rsl_rl checkpoint."""
-    encoder: str | None = None
-    """File of a network that sees the observation; the policy sees what it returns, too."""
-    encoder_first: bool = False
-    """Whether that stands before the policy's columns of the observation, not behind them."""
-    observation: tuple[Term, ...] = ()
-    """Terms in the order of its columns."""
-    joints: tuple[str, ...] | None = None
-    """Joints that it moves, in its order; the others hold the robot's default pose. All of the robot if None."""
-    hold: dict[str, float] | None = None
-    """Angles that joints beside those hold instead [rad]."""
-    wander: Wander | None = None
-    """How joints beside those swing about the angles that they hold."""
-    default: tuple[float, ...] | None = None
-    """Pose that joint angles are relative to [rad]; the robot's if None."""
-    action_scale: float | tuple[float, ...]
-    """Radians per unit of action."""
-    action_offset: tuple[float, ...] | None = None
-    """Targets at action 0 [rad]; ``default`` if None."""
-    action_clip: float | tuple[tuple[float, float], ...] | None = None
-    """Largest size of the network's output, or its limits, one pair a joint."""
-    action_delay_steps: NonNegativeInt = 0
-    """Control steps until an action takes effect."""
-    observation_clip: PositiveFloat | None = None
-    """Largest size of a column, applied last."""
+    policy: str  # file of the weights, beside it: TorchScript, ONNX, or an rsl_rl checkpoint
+    encoder: str | None = None  # file of a network that sees the observation; the policy sees what it returns, too
+    encoder_first: bool = False  # whether that stands before the policy's columns of the observation, not behind them
+    observation: tuple[Term, ...] = ()  # terms in the order of its columns
+    joints: tuple[str, ...] | None = None  # that it moves, in its order; the others hold the default pose; all if None
+    hold: dict[str, float] | None = None  # angles that joints beside those hold instead [rad]
+    wander: Wander | None = None  # how joints beside those swing about the angles that they hold
+    default: tuple[float, ...] | None = None  # pose that joint angles are relative to [rad]; the robot's if None
+    action_scale: float | tuple[float, ...]  # radians per unit of action
+    action_offset: tuple[float, ...] | None = None  # targets at action 0 [rad]; ``default`` if None
+    action_clip: float | tuple[tuple[float, float], ...] | None = None  # largest output, or limits of each joint's
+    action_delay_steps: NonNegativeInt = 0  # control steps until an action takes effect
+    observation_clip: PositiveFloat | None = None  # largest size of a column, applied last
     history: History | None = None
     activation: Annotated[str, Meta(pattern=f"^({'|'.join(ACTIVATIONS)})$")] | None = None
     """Function between the layers of an rsl_rl checkpoint that does not name it."""
@@ -175,33 +138,22 @@ def format_controller(cfg: ControllerCfg) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensed:
-    """What robots sense; tensors lead with num_envs, on the observation's device."""
+    """What robots sense, on the observation's device; a sense that the robot lacks has no columns."""
 
-    lin_vel: torch.Tensor
-    """Velocity of the base link's origin, base frame [m/s], shape (num_envs, 3)."""
-    ang_vel: torch.Tensor
-    """Angular velocity of the base, base frame [rad/s], shape (num_envs, 3)."""
-    gravity: torch.Tensor
-    """Direction of gravity, base frame, a unit vector: (0, 0, -1) upright; shape (num_envs, 3)."""
-    command: torch.Tensor
-    """Commanded v_x, v_y [m/s] in the base's yaw frame, and yaw rate [rad/s], shape (num_envs, 3)."""
-    joint_pos: torch.Tensor
-    """Joint angles [rad] in the order of ``robot.joint_names``, shape (num_envs, num_joints)."""
-    joint_vel: torch.Tensor
-    """Joint rates [rad/s], shape (num_envs, num_joints)."""
-    last_action: torch.Tensor
-    """What the controller last returned, clipped to +-100; 0 at the start; shape (num_envs, num_joints)."""
-    scan: torch.Tensor
-    """Height of the base over the ground at the scan points [m], clipped to -0.5..1.5; shape
-    (num_envs, len(scan_x), len(scan_y)): ``robot.scan_x`` ahead and ``robot.scan_y`` left of the base, yaw frame."""
-    base_pos: torch.Tensor
-    """Position of the base, world-local frame [m], shape (num_envs, 3); (num_envs, 0) without the sense ``pose``."""
-    quat: torch.Tensor
-    """Quaternion wxyz of the base, base to world frame, shape (num_envs, 4); (num_envs, 0) without ``pose``."""
-    contacts: torch.Tensor
-    """Contact force on each of ``robot.foot_geoms`` [N], shape (num_envs, num_feet); (num_envs, 0) without it."""
-    torques: torch.Tensor
-    """Torques of the joints in the last physics step [N m], shape (num_envs, num_joints); (num_envs, 0) without it."""
+    lin_vel: torch.Tensor  # velocity of the base link's origin, base frame [m/s], shape (num_envs, 3)
+    ang_vel: torch.Tensor  # angular velocity of the base, base frame [rad/s], shape (num_envs, 3)
+    gravity: torch.Tensor  # direction of gravity, base frame, a unit vector: (0, 0, -1) upright; shape (num_envs, 3)
+    command: torch.Tensor  # commanded v_x, v_y [m/s] in the base's yaw frame, and yaw rate [rad/s], shape (num_envs, 3)
+    joint_pos: torch.Tensor  # joint angles [rad] in the order of ``robot.joint_names``, shape (num_envs, num_joints)
+    joint_vel: torch.Tensor  # joint rates [rad/s], shape (num_envs, num_joints)
+    last_action: torch.Tensor  # what the controller last returned, clipped to +-100; shape (num_envs, num_joints)
+    # Height of the base over the ground at ``robot.scan_x`` ahead and ``robot.scan_y`` left of it, yaw frame [m],
+    # clipped to -0.5..1.5.
+    scan: torch.Tensor  # shape (num_envs, len(scan_x), len(scan_y))
+    base_pos: torch.Tensor  # position of the base, world-local frame [m], shape (num_envs, 3)
+    quat: torch.Tensor  # quaternion wxyz of the base, base to world frame, shape (num_envs, 4)
+    contacts: torch.Tensor  # contact force on each of ``robot.foot_geoms`` [N], shape (num_envs, num_feet)
+    torques: torch.Tensor  # torques of the joints in the last physics step [N m], shape (num_envs, num_joints)
 
 
 @lru_cache(maxsize=16)
@@ -267,8 +219,8 @@ class Described(torch.nn.Module):
         self._moved = self._find_joints(cfg.joints)
         self._wandering = self._find_joints(cfg.wander.joints, "wander.joints") if cfg.wander else ()
         if taken := {*self._moved} & {*self._wandering, *self._find_joints(tuple(cfg.hold or ()), "hold")}:
-            names = ", ".join(robot.joint_names[k] for k in sorted(taken))
-            self._refuse(f"hold and wander must name joints that the network does not move, got {names}")
+            names = [robot.joint_names[k] for k in sorted(taken)]
+            self._refuse(f"hold and wander must name joints that the network does not move, got {', '.join(names)}")
         self.num_actions = len(self._moved)
         for name in ("default", "action_scale", "action_offset", "action_clip"):
             values = getattr(cfg, name)
@@ -283,26 +235,21 @@ class Described(torch.nn.Module):
             self._check_limits(f"observation[{k}].clip", term.clip)
             for limit in np.ravel(term.limit or 0.0):
                 self._check_limits(f"observation[{k}].limit", limit)
-        history = cfg.history
-        self.lengths = [term.history or (history.length if history else 1) for term in cfg.observation]
-        if max(self.lengths) > 1 and history is None:
+        self.lengths = [term.history or (cfg.history.length if cfg.history else 1) for term in cfg.observation]
+        if max(self.lengths) > 1 and cfg.history is None:
             self._refuse("history must say how steps are laid out: {length = 1, newest, by, fill}")
-        if history is not None and history.by == "row" and len(set(self.lengths)) > 1:
+        if cfg.history is not None and cfg.history.by == "row" and len(set(self.lengths)) > 1:
             self._refuse(f'history.by must be "term" where terms have other lengths, got {self.lengths}')
-        self.observation_size = int(np.dot(self.widths, self.lengths))
-        """Columns that the network sees."""
+        self.observation_size = int(np.dot(self.widths, self.lengths))  # columns that the network sees
         terms = zip(cfg.observation, self.widths, self.lengths, strict=True)
         self.columns = ", ".join(f"{term.term} {width}" + (f" x {n}" if n > 1 else "") for term, width, n in terms)
-        """What the network sees, as text."""
         self.use(None, torch.device("cpu"))
 
     def use(self, network: Any, device: torch.device) -> None:
         """Set the network, which has :attr:`observation_size` columns and one action a joint."""
         cfg = self.cfg
-        self.network = network
-        self.graph_safe = is_graph_safe(network)
-        """Whether it may be captured as a CUDA graph, its ``reset`` too."""
-        self._device = device
+        self.network, self._device = network, device
+        self.graph_safe = is_graph_safe(network)  # its ``reset`` too
         self._memories: dict[int, _Memory] = {}  # by the number of robots: a graph keeps their addresses
 
         def constant(values: Any) -> torch.Tensor:
@@ -346,12 +293,10 @@ class Described(torch.nn.Module):
         names = joints if names is None else names
         unknown = [name for name in names if name not in joints]
         if unknown or len(set(names)) < len(names):
-            got = f"no {', '.join(unknown)}" if unknown else "each of them once"
-            self._refuse(f"{setting} must be the robot's, which has {got}, only {', '.join(joints)}")
+            self._refuse(f"{setting} must be the robot's, each once, got {', '.join(unknown or names)}, not {joints}")
         return tuple(joints.index(name) for name in names)
 
     def _find_columns(self, term: Term) -> Sequence[int]:
-        """The columns of its quantity that a term takes."""
         robot = self.robot
         if "joints" in TERMS[term.term]:
             return self._moved if term.joints is None else self._find_joints(term.joints)
@@ -407,8 +352,8 @@ class Described(torch.nn.Module):
                 quantity = sensed.lin_vel + torch.linalg.cross(sensed.ang_vel, constants.expand_as(sensed.ang_vel))
             elif term.term == "clock":
                 angle = memory.steps * (2.0 * math.pi * self.robot.control_dt / (term.period_s or math.inf))
-                angle = angle + 2.0 * math.pi * constants
-                quantity = torch.cat([getattr(angle, wave)() for wave in (term.order or "").split()], dim=1)
+                waves = (getattr(angle + 2.0 * math.pi * constants, wave)() for wave in (term.order or "").split())
+                quantity = torch.cat([*waves], dim=1)
             elif term.term == "constant":
                 quantity = constants.expand(len(row), -1)
             elif term.threshold is not None:
@@ -434,16 +379,16 @@ class Described(torch.nn.Module):
     @torch.inference_mode()
     def act(self, output: torch.Tensor) -> torch.Tensor:
         """The robot's actions from outputs of the network, shape (num_envs, num_actions)."""
-        memory = self._get_memory(len(output))
+        robot, memory = self.robot, self._get_memory(len(output))
         memory.action.copy_(output.clamp(*self._clip))
         actions = self._held.repeat(len(output), 1)
         if (wander := self.cfg.wander) is not None:
-            periods = memory.steps * (self.robot.control_dt / wander.period_s) + memory.phase + self._phases
-            actions[:, self._wanderers] += wander.amplitude / self.robot.action_scale * torch.sin(2 * math.pi * periods)
+            periods = memory.steps * (robot.control_dt / wander.period_s) + memory.phase + self._phases
+            actions[:, self._wanderers] += wander.amplitude / robot.action_scale * torch.sin(2 * math.pi * periods)
         memory.steps.add_(1.0)
         queue = torch.cat([memory.action[:, None], memory.sent], dim=1)
         memory.sent.copy_(queue[:, :-1])
-        actions[:, self._joints] = (self._offset + self._radians * queue[:, -1] - self._pose) / self.robot.action_scale
+        actions[:, self._joints] = (self._offset + self._radians * queue[:, -1] - self._pose) / robot.action_scale
         return actions
 
 

@@ -8,25 +8,40 @@ from pathlib import Path
 from typing import Any
 
 from sim.controllers.described import read_controller
-from sim.controllers.formats.booster import read_booster
-from sim.controllers.formats.deploy_yaml import read_deploy_yaml
-from sim.controllers.formats.holosoma import read_holosoma
-from sim.controllers.formats.isaac_lab import read_isaac_lab
-from sim.controllers.formats.leapp import read_leapp
-from sim.controllers.formats.legged_gym import read_legged_gym
-from sim.controllers.formats.mjlab import read_mjlab
-from sim.controllers.formats.network import load_network
+from sim.controllers.formats.deployments import read_deploy_yaml, read_rl_sar, read_unitree_rl_gym
+from sim.controllers.formats.described_onnx import read_holosoma, read_leapp, read_mjlab
+from sim.controllers.formats.isaac import read_booster, read_isaac_lab, read_legged_gym
+from sim.controllers.formats.network import find_widths, load_network
 from sim.controllers.formats.onnx_data import read_metadata
-from sim.controllers.formats.rl_sar import read_rl_sar
-from sim.controllers.formats.source import Source
-from sim.controllers.formats.unitree_rl_gym import read_unitree_rl_gym
-from sim.controllers.formats.weights import read_weights_alone
+from sim.controllers.formats.source import BLIND_TERMS, Source, make_term, make_terms
 from sim.controllers.spec import data_file
 from sim.files.command import command_line
-from sim.files.settings import YAML_SUFFIXES, read_yaml, to_toml
+from sim.files.settings import read_yaml, to_toml
 from sim.robots.compiled import PER_JOINT
 from sim.robots.model_files import MENAGERIE, find_model, find_robot_of_scene
 from sim.robots.user import NEW_NAME, is_new_name
+
+
+def _read_weights_alone(path: Path, source: Source) -> Path:
+    """Leaves nearly all settings for the user to fill in, and says what belongs there."""
+    network: Any = load_network(path, "cpu", None, label="it")
+    width, count = find_widths(network)
+    if activation := getattr(getattr(network, "head", network), "activation", None):
+        source.set(activation=activation)
+    pose = f"an angle of each joint [rad], its pose at action 0: {', '.join(source.joints)}"
+    home = source.robot_file.home
+    source.set(default_joint_pos=home, reason="" if home else pose)
+    if not source.model.nu or not source.model.actuator_biasprm[:, 1].any():
+        for name, unit in (("stiffness", "N m/rad"), ("damping", "N m s/rad")):
+            source.set(**{name: None}, reason=f"a gain of each joint, or one number [{unit}]")
+    source.set(physics_dt=0.005, decimation=4, reason="50 control steps a second, as most controllers have")
+    source.set(action_scale=None, reason="radians per unit of action, one or one a joint")
+    if count not in (None, len(source.joints)):
+        source.set(joints=None, reason=f"the {count} joints that it moves, in its order")
+    example = to_toml([make_term("lin_vel", at=source.find_imu()), *make_terms(BLIND_TERMS, {})])
+    source.set(observation=None, reason=f"its {width or 'all'} columns in its order, with scale; of {example}")
+    return path
+
 
 _LAB = "a deployment of unitree_rl_lab or unitree_rl_mjlab (a folder with params/deploy.yaml, or that file)"
 FORMATS = (
@@ -39,7 +54,7 @@ FORMATS = (
     ({"*.gait_frequency"}, read_booster, "a controller of Booster Gym (the YAML of its deployment or training)"),
     ({"observation_names"}, read_mjlab, "a controller of mjlab (an ONNX file with its metadata)"),
     ({"dof_names", "kp", "kd"}, read_holosoma, "a controller of holosoma (an ONNX file with its metadata)"),
-    ({"weights"}, read_weights_alone, "weights alone (an rsl_rl checkpoint, TorchScript or ONNX)"),
+    ({"weights"}, _read_weights_alone, "weights alone (an rsl_rl checkpoint, TorchScript or ONNX)"),
 )
 """Formats of sources: the first whose marks a path has reads it into a Source, and returns the file of the weights."""
 _DRIVE_SETTINGS = (*PER_JOINT, "actuator_net", "drive_delay_steps")
@@ -58,7 +73,7 @@ def _list_marks(path: Path) -> set[str]:
         file = next(filter(Path.is_file, files), path)
     if file.suffix == ".onnx":
         return {"weights", *read_metadata(file)}
-    if file.is_file() and file.suffix not in (*YAML_SUFFIXES, ".json"):
+    if file.is_file() and file.suffix not in (".yaml", ".yml", ".json"):
         return {"weights"}
     if not file.is_file() or file.name == "env.yaml":  # which is long
         return {file.relative_to(path).as_posix()}
@@ -67,15 +82,13 @@ def _list_marks(path: Path) -> set[str]:
 
 
 def import_controller(path: Path, model: str | Path | None, out: Path) -> bool:
-    """Writes robot.toml and controller.toml, with the weights beside them, to the folder ``out``, and prints both.
+    """Writes robot.toml and controller.toml of a source to the folder ``out``, with the weights, and prints both.
 
-    ``path`` is a source of one of :data:`FORMATS`; the robot is called after the folder. ``model`` is what
-    :func:`sim.robots.model_files.find_model` finds; None if the source names its model.
-    Returns whether nothing is left to be filled in.
+    ``model`` is what :func:`sim.robots.model_files.find_model` finds; None if the source names its model. The robot is
+    called after the folder. Returns whether nothing is left to be filled in.
     """
-    if existing := [str(out / name) for name in _SETTINGS_BY_FILE if (out / name).exists()]:
-        files = " and ".join(existing)
-        raise ValueError(f"--out must name a folder without a robot, got {files}: move them away first")
+    if existing := " and ".join(str(out / name) for name in _SETTINGS_BY_FILE if (out / name).exists()):
+        raise ValueError(f"--out must name a folder without a robot, got {existing}: move them away first")
     if not is_new_name(out.resolve().name):
         raise ValueError(f"--out must end in {NEW_NAME}, got {out}")
     if not path.exists():
@@ -131,7 +144,6 @@ def _read(reader: Callable[[Path, Source], Path], label: str, path: Path, source
 
 
 def _format_setting(name: str, source: Source) -> str:
-    """The line of a setting in its file."""
     value: Any = source.settings[name]
     reason = source.reasons[name]
     if value is None:

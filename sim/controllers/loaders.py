@@ -24,23 +24,21 @@ from sim.robots.find import get_robot
 from sim.robots.robot import RobotCfg, robot_digest
 
 _EXPECTED = "expected a .toml, .pt, .ts or .onnx file, module:callable or module:adapter@file (docs/controllers.md)"
-PolicySpec = str | Path | Policy
-"""A controller as :func:`load_policy` takes it, or as a callable."""
+PolicySpec = str | Path | Policy  # a controller as :func:`load_policy` takes it, or as a callable
 _print_once = functools.cache(print)
 
 
 def prepare_torch(device: str) -> None:
     """Let torch work on Warp's stream of ``device``, so that both see each other's results without waiting.
 
-    On the CPU, torch gets one thread, as Warp has: batches are small, and a second thread only waits on a busy core. On
-    CUDA it takes algorithms that repeat, and multiplies in TF32: networks learned under more noise than it adds.
+    On CUDA it takes algorithms that repeat, and multiplies in TF32: networks learned under more noise than it adds.
     """
     if device.startswith("cuda"):
         torch.backends.cudnn.deterministic = True
         torch.set_float32_matmul_precision("high")
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(device)))
     else:
-        torch.set_num_threads(1)
+        torch.set_num_threads(1)  # as Warp has: batches are small, and a second thread only waits on a busy core
 
 
 class _TorchMemory:
@@ -55,24 +53,20 @@ class _TorchMemory:
 
 @contextmanager
 def on_stream(stream: torch.cuda.Stream | None) -> Iterator[None]:
-    """Let torch and Warp work on ``stream``; neither it nor the present one waits for the other.
-
-    Warp's arrays that are made meanwhile must not be used afterwards. None changes nothing.
-    """
+    """Let torch and Warp work on ``stream``, if any, without waiting; Warp's arrays of that time are not for later."""
     if stream is None:
         yield
-        return
-    on_warp = wp.stream_from_torch(stream)
-    memory = wp.ScopedAllocator(on_warp.device, _TorchMemory())
-    with torch.cuda.stream(stream), wp.ScopedStream(on_warp, sync_enter=False), memory:
-        yield
+    else:
+        on_warp = wp.stream_from_torch(stream)
+        memory = wp.ScopedAllocator(on_warp.device, _TorchMemory())
+        with torch.cuda.stream(stream), wp.ScopedStream(on_warp, sync_enter=False), memory:
+            yield
 
 
 def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     """Loads a controller, as :class:`ControllerSpec` names it, and tries it on rows of the robot, on a Warp device.
 
-    Files are loaded as data only, though C++ reads TorchScript and ONNX, which a file made to harm can crash; code runs
-    only from a module or Python file that is named. A warning says if the record of a training names another robot.
+    Files are loaded as data only; code runs only from a module or Python file that is named.
     """
     device = str(torch.device("cuda", wp.get_device(device).ordinal)) if device.startswith("cuda") else "cpu"
     if device != "cpu" and not torch.cuda.is_available():
@@ -82,8 +76,7 @@ def load_policy(spec: str | Path, robot: RobotCfg, device: str) -> Policy:
     _try_rows(policy, (robot.observation_size, robot.num_joints), device, str(spec), f"robot '{robot.name}'")
     if named.module is None and not _separates_rows(policy, robot.observation_size, device):
         what = "fails, or acts differently in an episode's first step, beside other rows or after other steps"
-        why = "it mixes rows, draws at random, or remembers across a reset"
-        raise ValueError(f"policy '{spec}' {what}: {why}: export it without that")
+        raise ValueError(f"policy '{spec}' {what}: export it without batches, chance or memory across a reset")
     if named.file is not None and multiprocessing.parent_process() is None:  # a worker's parent warns
         _warn_if_trained_otherwise(Path(named.file), robot)
     return policy
@@ -122,8 +115,7 @@ def _load_code(spec: ControllerSpec, robot: RobotCfg, device: str) -> Any:
     try:
         policy = target(*arguments.values())
     except Exception as error:
-        what = f"failed, called with ({', '.join(arguments)})"
-        raise ValueError(f"policy '{spec}' {what}: {in_one_line(error)}") from error
+        raise ValueError(f"policy '{spec}' failed on ({', '.join(arguments)}): {in_one_line(error)}") from error
     if not callable(policy):
         raise ValueError(f"policy '{spec}' must return a callable, got {type(policy).__name__}")
     return policy
@@ -185,16 +177,15 @@ def _load_encoded(policy: Described, weights: Path, path: Path, load: functools.
 @torch.inference_mode()
 def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, label: str) -> None:
     """Tries a controller of these observation and action sizes on four robots that begin an episode."""
-    shape = (4, sizes[0])
     try:
         reset_all(policy, 4, device)
-        action = policy(torch.zeros(shape, device=device))
+        action = policy(torch.zeros((4, sizes[0]), device=device))
     except (Exception, SystemExit) as error:  # a controller can fail with anything
         width = find_widths(policy)[0] if isinstance(policy, torch.nn.Module) else None
+        why = f"failed on rows of shape {(4, sizes[0])} of {label}: {in_one_line(error)}"
         if width not in (None, sizes[0]):
-            what = f"takes {width} columns, {label} gives {sizes[0]}"
-            raise ValueError(f"policy '{spec}' {what}: describe those that it takes (docs/controllers.md)") from error
-        raise ValueError(f"policy '{spec}' failed on rows of shape {shape} of {label}: {in_one_line(error)}") from error
+            why = f"takes {width} columns, {label} gives {sizes[0]}: describe those that it takes (docs/controllers.md)"
+        raise ValueError(f"policy '{spec}' {why}") from error
     if problem := action_problem(action, (4, sizes[1])):
         raise ValueError(f"policy '{spec}' must return {sizes[1]} joints' actions for 4 robots, {problem}")
     if not torch.isfinite(action).all():
@@ -204,8 +195,7 @@ def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, label
 @torch.inference_mode()
 def _separates_rows(policy: Any, width: int, device: str) -> bool:
     """Whether a robot that begins an episode gets the same action beside any others, whatever steps came before."""
-    generator = torch.Generator().manual_seed(0)
-    first_actions: list[torch.Tensor] = []
+    first_actions, generator = [], torch.Generator().manual_seed(0)
     row = 3.0 * torch.randn(width, generator=generator)
     for count in (3, 40):
         steps = 3.0 * torch.randn((12, count, width), generator=generator)

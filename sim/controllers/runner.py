@@ -11,9 +11,8 @@ import warp as wp
 from sim.controllers.spec import in_one_line
 from sim.device import recording
 
+# Torch sums matrix products of fewer than 4 or 16 rows in another order; 16 to 4,096 give each row the same bits.
 _MIN_ROWS = 32
-"""Torch sums matrix products in another order for fewer than 4 or 16 rows, by processor. Batches of 16 to 4,096 rows
-give each row the same bits (measured with AVX2 and AVX-512)."""
 
 
 def with_rows_of_zeros(rows: torch.Tensor) -> torch.Tensor:
@@ -34,12 +33,9 @@ def action_problem(action: Any, shape: tuple[int, ...]) -> str | None:
 class Memory(Enum):
     """What a policy remembers from one step to the next, by its ``reset``."""
 
-    NONE = "no reset"
-    """Nothing."""
-    PER_ROBOT = "reset(rows)"
-    """Each robot. Before every step ``rows``, bool, shape (num_envs,), is true where a robot begins an episode."""
-    SHARED = "reset()"
-    """All robots, which can only begin together; robots whose episode has ended stand idle until then."""
+    NONE = "no reset"  # nothing
+    PER_ROBOT = "reset(rows)"  # each robot; before every step rows, bool, (num_envs,), are true where one begins anew
+    SHARED = "reset()"  # all robots, which begin together; those whose episode has ended stand idle until then
 
 
 def find_memory(policy: Any) -> Memory:
@@ -66,8 +62,7 @@ def reset_all(policy: Any, num_envs: int, device: str = "cpu") -> bool:
 class Recurrent(torch.nn.Module):
     """A network with a state of each robot, for any number of robots, at fixed addresses of the device."""
 
-    graph_safe = True
-    """Whether steps, and a reset, may be captured as a CUDA graph."""
+    graph_safe = True  # whether steps, and a reset, may be captured as a CUDA graph
 
     def __init__(self, initial: Sequence[torch.Tensor], axis: int) -> None:
         """States at the start of an episode, with one robot along ``axis``."""
@@ -107,10 +102,7 @@ class Recurrent(torch.nn.Module):
 
 
 def is_graph_safe(policy: Any) -> bool:
-    """Whether a policy may be captured as a CUDA graph: as its ``graph_safe`` says, else a module without memory.
-
-    It has fixed shapes then, and its ``reset(rows)`` writes in place.
-    """
+    """Whether a policy may be captured as a CUDA graph: as its ``graph_safe`` says, else a module without memory."""
     return getattr(policy, "graph_safe", isinstance(policy, torch.nn.Module) and find_memory(policy) is Memory.NONE)
 
 
@@ -118,10 +110,7 @@ class PolicyRunner:
     """Runs a policy between two Warp buffers; one that :func:`is_graph_safe` is captured as a CUDA graph."""
 
     def __init__(self, policy: Any, observation: Any, action: Any, begins: Any) -> None:
-        """Binds the policy to Warp arrays (num_envs, observation_size), (num_envs, num_joints) and (num_envs,).
-
-        ``begins`` is not 0 where an episode begins with the coming step.
-        """
+        """Binds the policy to Warp arrays; ``begins`` is not 0 where an episode begins with the coming step."""
         self._policy = policy
         self.memory = find_memory(policy)
         self._observation, self._action, self._begins = map(wp.to_torch, (observation, action, begins))

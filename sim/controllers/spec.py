@@ -17,8 +17,7 @@ from typing import Any
 from sim.files.provenance import ROOMS, ROOT
 from sim.robots.robot import RobotCfg, robot_identity
 
-SHIPPED = "shipped"
-"""Name of the controller that comes with the robot."""
+SHIPPED = "shipped"  # name of the controller that comes with the robot
 _NAMED = re.compile(r"(?P<module>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]*)(?:@(?P<file>.+))?", re.DOTALL)
 
 
@@ -26,10 +25,8 @@ _NAMED = re.compile(r"(?P<module>[A-Za-z_][\w.]*|.+\.py):(?P<name>[A-Za-z_][\w.]
 class ControllerSpec:
     """``file``, ``module:callable`` or ``module:adapter@file``; a Python file may stand for the module."""
 
-    module: str | None = None
-    """Module, or file whose name ends in .py; None if no code is named."""
-    name: str | None = None
-    """Name of the callable in it."""
+    module: str | None = None  # module, or file whose name ends in .py; None if no code is named
+    name: str | None = None  # name of the callable in it
     file: str | None = None
 
     @classmethod
@@ -39,8 +36,7 @@ class ControllerSpec:
         return cls(file=str(spec)) if match is None else cls(**match.groupdict())
 
     def __str__(self) -> str:
-        code = self.module and f"{self.module}:{self.name}"
-        return "@".join(filter(None, (code, self.file)))
+        return "@".join(filter(None, (self.module and f"{self.module}:{self.name}", self.file)))
 
     @property
     def runs_code(self) -> bool:
@@ -59,15 +55,13 @@ class ControllerSpec:
         files = [Path(self.file)] if self.file is not None else []
         if self.file is not None and files[0].suffix == ".toml":
             files += filter(None, (weights_file(files[0], key) for key in ("policy", "encoder")))
-        beside = [find(file) for file in files for find in (agent_file, data_file)]
-        return (*code, *files, *filter(None, beside))
+        return (*code, *files, *filter(None, [find(file) for file in files for find in (agent_file, data_file)]))
 
     def in_folder(self, folder: Path) -> "ControllerSpec":
         """The same with its files in another folder."""
-        module = self.module
-        if module is not None and module.endswith(".py"):
-            module = str(folder / Path(module).name)
-        return replace(self, module=module, file=self.file and str(folder / Path(self.file).name))
+        files = [name and str(folder / Path(name).name) for name in (self.module, self.file)]
+        is_file = self.module is not None and self.module.endswith(".py")
+        return replace(self, module=files[0] if is_file else self.module, file=files[1])
 
 
 def weights_file(path: Path, key: str = "policy") -> Path | None:
@@ -102,10 +96,7 @@ def resolve_policy(policy: str, robot: RobotCfg) -> str:
 
 
 def controller_hash(policy: str | Path) -> str | None:
-    """SHA-256 of a controller's file, or of all its files and the callable's name; None if a file is missing.
-
-    Files that code reads or imports are not part of it.
-    """
+    """SHA-256 of a controller's file, or of all that it names and the callable's name; None if a file is missing."""
     spec = ControllerSpec.parse(policy)
     files = list(spec.files)
     if spec.module is not None and not spec.module.endswith(".py"):
@@ -152,10 +143,8 @@ def run_file(path: Path) -> ModuleType:
         raise ValueError(f"{path}: no such file")
     path = path.resolve()
     name = f"faultline_file_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None:
-        raise ValueError(f"{path} is no Python file: expected a name that ends in .py")
-    module = importlib.util.module_from_spec(spec)
+    module = ModuleType(name)
+    module.__file__ = str(path)
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # last: a neighbour must not stand in for an installed package
     importlib.invalidate_caches()
@@ -186,10 +175,7 @@ def describe_controllers(controllers: Mapping[str, str], robot: RobotCfg) -> dic
 
 
 def parse_controllers(policies: Sequence[str], robot: RobotCfg, *, flag: str = "policies") -> dict[str, str]:
-    """Policy of each controller by its name, in the order given; the robot's own as ``base`` if there is none.
-
-    Each is ``NAME=POLICY``; a text may hold several, with spaces. Errors name the ``flag``.
-    """
+    """Policy of each controller by its name, of texts of ``NAME=POLICY``; the robot's as ``base`` without any."""
     text = " ".join(policies).strip() or f"base={SHIPPED}"
     controllers: dict[str, str] = {}
     for item in re.split(r"\s+(?=[^\s=]+=)", text):  # a file's name may hold spaces: split where the next name is

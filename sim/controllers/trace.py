@@ -57,10 +57,7 @@ def _label_columns(controller: Described) -> list[str]:
 
 @torch.inference_mode()
 def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
-    """The first differences between a log and a contract, as lines; none if they agree as far as the log says.
-
-    The log begins with an episode, and has every control step.
-    """
+    """The first differences, as lines, between a contract and a log of every control step from an episode's start."""
     controller = load_policy(policy, robot, "cpu")
     if not isinstance(controller, Described):
         raise ValueError(f"--trace needs a controller.toml, whose columns have names, got {policy}")
@@ -76,13 +73,12 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
         quantities.append((log.get(name, torch.zeros(len(observation), width)) - zeros) * torch.tensor(scale))
     row = torch.cat(quantities, dim=1)
     rows = torch.nn.functional.pad(row, (0, robot.observation_size - row.shape[1])).split(1)
-    rebuilt: list[torch.Tensor] = []
-    answers: list[torch.Tensor] = []
+    rebuilt, answers = [], []
     reset_all(controller, 1)
-    for step, row in enumerate(rows):
+    for row, seen, done in zip(rows, observation.split(1), log.get("action", observation).split(1), strict=True):
         rebuilt.append(controller.observe(row))
-        answers.append(controller.network(observation[step : step + 1]).clone())
-        controller.act(log["action"][step : step + 1] if "action" in log else answers[-1])
+        answers.append(controller.network(seen).clone())
+        controller.act(done if "action" in log else answers[-1])
     labels = _label_columns(controller)
     names = [label.partition(" ")[0] for label in labels]
     if unknown := [name for name in names if not log.keys() >= {*_NEEDS.get(name, (name,))}]:
@@ -97,7 +93,6 @@ def compare_log(file: Path, policy: str, robot: RobotCfg) -> list[str]:
 
 
 def _compare(name: str, ours: torch.Tensor, theirs: torch.Tensor, labels: Sequence[str]) -> list[str]:
-    """A line about the first difference, if there is one."""
     differs = (ours - theirs).abs() > _TOLERANCE * theirs.abs().clamp(min=1.0)
     if not differs.any():
         return []

@@ -1,7 +1,6 @@
 """What all commands share: option groups, how a command starts and fails, how a result is published.
 
-A command is a frozen dataclass: its docstring is its help, its fields are its flags, ``execute`` does the work. Its
-module loads quickly; what takes seconds to import (torch, warp, newton, pyribs) is imported inside ``execute``.
+A command is a frozen dataclass: docstring and fields are its help and flags, ``execute`` imports what loads slowly.
 """
 
 import inspect
@@ -95,13 +94,14 @@ class EliteFlags(SpaceFlag):
 _EXTRAS = {"rsl_rl": "train", "tensordict": "train", "tensorboard": "train", "onnx": "onnx", "onnxruntime": "onnx"}
 """Extras of pyproject.toml by the modules of theirs that are imported; what searches and shows needs none."""
 BEGAN = time.monotonic()  # when the program began [s]
+Report = dict[str, Any]
+Draw = Callable[[Report], bytes]
 
 
 class UserError(Exception):
     """An error that a user can mend, where no built-in type fits; only its text is shown."""
 
-    status = 2
-    """Exit status."""
+    status = 2  # of the exit
 
 
 class Interrupted(KeyboardInterrupt):
@@ -119,14 +119,11 @@ def with_traceback(error: BaseException, text: str) -> str:
 
 
 def run_command(cls: Any, argv: Sequence[str], *, name: str) -> int:
-    """Parses the flags of the command that the word ``name`` calls, checks them against their ranges, and runs it.
+    """Parses the flags of the command that the word ``name`` calls, checks them, runs it, and returns its exit status.
 
-    A command whose defaults follow from some of its flags has a class method ``defaults(argv)``.
-
-    Returns:
-        Exit status: what ``execute`` returns if that is a number, else 0; 2 for wrong flags and what a user can mend,
-        with one line on stderr, or the traceback where FAULTLINE_DEBUG=1 and of any other error; that of a UserError;
-        130 for Ctrl-C and SIGTERM; 1 without a line if the output is closed, as in ``faultline ... | head -1``.
+    That is 2, or a UserError's, for wrong flags and what a user can mend, with one line on stderr, and for any other
+    error, with the traceback, as all have where FAULTLINE_DEBUG=1; 130 for Ctrl-C and SIGTERM; 1 if the output is
+    closed, as in ``faultline ... | head -1``. The class method ``defaults(argv)`` makes defaults follow from flags.
     """
     signal.signal(signal.SIGTERM, _interrupt)
     try:
@@ -246,11 +243,7 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 
 def command_line(name: str, **flags: object) -> str:
-    """A command as it is typed: ``faultline replay --run runs/x --elite 0``.
-
-    Flags are named by fields. None, False and empty lists are left out, True is a bare flag. Paths below the working
-    folder become relative.
-    """
+    """A command as it is typed, with paths from here; None, False and empty lists are left out, True is a bare flag."""
     argv = ["faultline", name]
     for field, value in flags.items():
         flag = f"--{field.replace('_', '-')}"
@@ -282,23 +275,16 @@ def choose_elites(text: str, numbers: Sequence[int], missing: str) -> list[int]:
 
 
 def publish(
-    out: Path | None,
-    measure: Callable[[], dict[str, Any]],
-    show: Callable[[dict[str, Any]], None],
-    *,
-    draw: Callable[[dict[str, Any]], bytes] | None = None,
-) -> dict[str, Any]:
-    """Measures a report, shows it, writes it to the JSON file ``out`` if given, and returns it.
-
-    ``draw`` makes the PNG beside the JSON. Both files are tried before the work.
-    """
+    out: Path | None, measure: Callable[[], Report], show: Callable[[Report], None], *, draw: Draw | None = None
+) -> Report:
+    """Measures a report, shows it, writes it to the JSON ``out``, beside the PNG of ``draw``, and returns it."""
     writers: dict[Path, Callable[..., bytes]] = {} if out is None else {out: to_json}
     if out is not None and draw is not None:
         if out.suffix != ".json":
             raise ValueError(f"out must be a file named *.json, beside which the figure is written as .png, got {out}")
         writers[out.with_suffix(".png")] = draw
     for file in writers:
-        prepare_output(file)
+        prepare_output(file)  # before the work
     report = measure()
     show(report)
     for file, write in writers.items():

@@ -8,20 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-RATES = (0.0, 1.0)
-"""Bounds of rates."""
-DIFFERENCES = (-1.0, 1.0)
-"""Bounds of differences of rates."""
+_Values = NDArray[np.floating]
+_Bounds = tuple[float, float]
+RATES = (0.0, 1.0)  # bounds of rates
+DIFFERENCES = (-1.0, 1.0)  # bounds of differences of rates
 _Z = 1.959963984540054  # the normal distribution's 97.5 % quantile
 _BOOTSTRAP_DRAWS = 10_000
 _MIN_DIFFERING = 10  # with so many families that differ from the others, resampling shows how far the mean may lie
 
 
 def wilson_interval(hits: float, count: int) -> tuple[float, float]:
-    """Wilson score interval of a rate (Wilson 1927): ``hits`` of ``count`` independent trials; 0 to 1 without any.
-
-    Trials that are rates themselves may make a fraction of a hit; they differ less than hits and misses.
-    """
+    """Wilson score interval of a rate (Wilson 1927): ``hits``, maybe a fraction, of ``count``; 0 to 1 of none."""
     if not 0 <= hits <= count:
         raise ValueError(f"a rate needs 0 <= hits <= count, got {hits} of {count}")
     if count == 0:
@@ -43,20 +40,13 @@ def resamples(count: int, seed: int, draws: int = _BOOTSTRAP_DRAWS) -> NDArray[n
 
 
 def bootstrap_interval(
-    values: NDArray[np.floating],
-    seed: int,
-    *,
-    families: NDArray[np.int64] | None = None,
-    bounds: tuple[float, float] | None = None,
+    values: _Values, seed: int, *, families: NDArray[np.int64] | None = None, bounds: _Bounds | None = None
 ) -> list[float] | None:
     """Interval of the mean of ``values`` (num_terrains,), resampling terrains; None of fewer than two families.
 
-    One seed draws the same resamples for all values of equally many terrains, so that they can be compared in pairs.
-    Terrains of one family, by their numbers (num_terrains,), are drawn together. The fewer families, the farther out
-    are the quantiles (the expanded percentile interval of Hesterberg 2015).
-
-    Where nearly all values are equal, resamples lack rare ones. With ``bounds``, :data:`RATES` or :data:`DIFFERENCES`,
-    the interval is then at least as wide as Wilson's, for differences combined after Newcombe (1998, method 10).
+    One seed draws the same resamples for equally many terrains; those of one family are drawn together. Quantiles are
+    those of Hesterberg's expanded percentile interval (2015). Resamples lack rare values: with ``bounds``,
+    :data:`RATES` or :data:`DIFFERENCES`, the interval is at least as wide as Wilson's, or Newcombe's (1998, method 10).
     """
     family = np.arange(len(values)) if families is None else np.unique(families, return_inverse=True)[1]
     count = int(family.max(initial=-1)) + 1
@@ -68,14 +58,11 @@ def bootstrap_interval(
     low, high = np.quantile(means, [tail, 1.0 - tail])
     if bounds is not None:
         lowest, highest = _bound_rare(values, family, count, bounds)
-        low = min(low, lowest)
-        high = max(high, highest)
+        low, high = min(low, lowest), max(high, highest)
     return [float(low), float(high)]
 
 
-def _bound_rare(
-    values: NDArray[np.floating], family: NDArray[np.int64], count: int, bounds: tuple[float, float]
-) -> tuple[float, float]:
+def _bound_rare(values: _Values, family: NDArray[np.int64], count: int, bounds: _Bounds) -> _Bounds:
     """How far the mean may lie if few of ``count`` families differ from 0, or 1; the mean itself if many do."""
     mean = float(values.mean())
     apart = values - (1.0 if bounds == RATES and mean > 0.5 else 0.0)

@@ -21,10 +21,7 @@ def array_names(path: Path) -> list[str]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, *, max_bytes: float = float("inf")
 ) -> dict[str, NDArray[Any]]:
-    """All arrays of an npz file, or some by name; any Exception if it is damaged, another file, or lacks one.
-
-    An array of more than ``max_bytes`` is refused, since a packed file of zeros is small at any size.
-    """
+    """All arrays of an npz file, or some by name; any Exception if it is damaged, or lacks one, or one is larger."""
     with zipfile.ZipFile(path) as members:
         available = [name.removesuffix(_ENDING) for name in members.namelist()]
         names = available if names is None else names
@@ -51,10 +48,7 @@ def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, Sequen
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]], *, compression: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """A packed npz file, which ``numpy.load`` reads; equal arrays give equal bytes.
-
-    ``zipfile.ZIP_BZIP2`` packs whole numbers into half of the bytes, and takes longer.
-    """
+    """A packed npz file; equal arrays give equal bytes. ``zipfile.ZIP_BZIP2`` halves whole numbers, but is slow."""
     whole = io.BytesIO()
     with zipfile.ZipFile(whole, "w", compression) as members:
         for name, values in arrays.items():

@@ -16,20 +16,17 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-ROOMS = ("kernels", "sim", "qd", "train")
-"""Folders of the source code."""
+ROOMS = ("kernels", "sim", "qd", "train")  # folders of the source code
 
-ROOT = Path(__file__).resolve().parents[2]
-"""Folder of the rooms."""
+ROOT = Path(__file__).resolve().parents[2]  # folder of the rooms
 _PACKAGES = ("newton", "mujoco", "mujoco-warp", "warp-lang", "torch", "onnxruntime", "ribs", "rsl-rl-lib", "numpy")
-_SOURCES = (".py", ".cu", ".xml")
+_SOURCES = (".py", ".cu", ".toml", ".xml")
 
 
 def provenance(device: str, seed: int) -> dict[str, Any]:
     """Command (by :func:`without_machine`), commit, hash of the sources, device, versions, seed and date of a result.
 
-    ``dirty`` says whether sources or scripts differ from the commit; None if git cannot tell. FAULTLINE_COMMIT names
-    the commit where there is no git, and ends in -dirty if they differ.
+    ``dirty``: sources or scripts differ from the commit; None if unknown. FAULTLINE_COMMIT (-dirty) stands for git.
     """
     variable = os.environ.get("FAULTLINE_COMMIT", "")
     commit = variable.removesuffix("-dirty") or None
@@ -57,15 +54,15 @@ def provenance(device: str, seed: int) -> dict[str, Any]:
 @cache
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on, as far as they are installed."""
-    found = {"python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+            installed[name] = version(name)
+    return installed
 
 
 def sources_sha256(rooms: Sequence[str] = ROOMS) -> str:
-    """SHA-256 of the source files of rooms: Python, CUDA and robot models."""
+    """SHA-256 of the source files of rooms: Python, CUDA, robots and tables of settings."""
     digest = hashlib.sha256()
     for room in rooms:
         for path in sorted((ROOT / room).rglob("*")):

@@ -1,7 +1,4 @@
-"""Settings: types and ranges stand on the fields of dataclasses, and msgspec checks values against them.
-
-A range is written ``Annotated[int, Meta(ge=1)]`` with :class:`msgspec.Meta`. Floats must be finite.
-"""
+"""Settings: dataclasses whose fields say types and ranges, as ``Annotated[int, Meta(ge=1)]``, checked by msgspec."""
 
 import json
 import math
@@ -25,7 +22,6 @@ NonNegativeFloat = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Interval = Annotated[tuple[float, float], Meta(description="the lower limit first")]
 
-YAML_SUFFIXES = (".yaml", ".yml")
 
 Settings = TypeVar("Settings")
 

@@ -18,11 +18,7 @@ Array = NDArray[np.float64]
 
 
 class ActuatorNet:
-    """A network of ``count`` drives from the beginning of an episode on, in NumPy.
-
-    ``layers`` are matrices, the bias first, with rows gate by gate of an LSTM; ``sizes``, ``inputs``,
-    ``num_recurrent``, ``activation`` and ``history`` are those of :func:`kernels.actuator_net.make_torques`.
-    """
+    """A network of ``count`` drives in an episode, with layers as :func:`kernels.actuator_net.make_torques` has."""
 
     def __init__(self, cfg: ActuatorNetCfg, count: int = 0) -> None:
         """Loads the file as data; an error says what is wrong with it."""
@@ -45,7 +41,7 @@ class ActuatorNet:
             layer[0] = layer[0] + weights[name.replace("weight_ih", "bias_hh")]
             layer.append(weights[name.replace("weight_ih", "weight_hh")])
         self.num_recurrent = len(lstms)
-        self.layers = [*map(np.column_stack, columns)]
+        self.layers = [*map(np.column_stack, columns)]  # the bias first, rows gate by gate of an LSTM
         self.sizes = [len(weights[name]) // (4 if name in lstms else 1) for name in names]
         count = columns[0][1].shape[1]
         ago = cfg.input_idx or tuple(range(count // 2))

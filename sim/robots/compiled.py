@@ -1,18 +1,13 @@
-"""A robot's file as MuJoCo compiles it, in the one form that simulations and pictures are made of, and its drives.
-
-Each joint has at most one actuator, of the joint's name: of positions, or a motor for an actuator network. Geoms touch
-the ground and nothing else; options are MuJoCo's but gravity and ``impratio``.
-"""
+"""A robot's file as MuJoCo compiles it: at most one actuator a joint, with its name; geoms touch the ground alone."""
 
 import itertools
 import re
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -23,8 +18,7 @@ from sim.files.command import with_traceback
 from sim.robots.model_files import ModelFiles, read_model_files
 from sim.robots.robot import RobotCfg
 
-mj: Any = mujoco
-"""MuJoCo, whose stubs lack most types."""
+mj: Any = mujoco  # MuJoCo, whose stubs lack most types
 _JOINT = mj.mjtTrn.mjTRN_JOINT
 _GAINS = ("stiffness", "damping", "effort_limit", "armature")
 PER_JOINT = ("default_joint_pos", *_GAINS, "saturation_effort", "velocity_limit")
@@ -61,12 +55,7 @@ def joint_names(model: Any) -> tuple[str, ...]:
 
 @lru_cache(maxsize=8)
 def number_links(robot: RobotCfg) -> NDArray[np.int32]:
-    """Bodies by their numbers from ``-LINKS`` to ``LINKS``, shape (2 * LINKS + 1,).
-
-    The base is 0, links on its left have positive numbers, those on its right negative ones, and those in its middle
-    both. They are counted leg after leg, each from the base on, in the model's order. More or fewer than ``LINKS`` on a
-    side have numbers that are spread over them.
-    """
+    """Bodies by number from ``-LINKS``, on the right, over 0, the base, to ``LINKS``, spread over each side's links."""
     model = robot_spec(robot).compile()
     data = mj.MjData(model)
     data.qpos[3:7] = 1.0, 0.0, 0.0, 0.0
@@ -79,7 +68,7 @@ def number_links(robot: RobotCfg) -> NDArray[np.int32]:
 
 
 def number_arm_actuators(robot: RobotCfg, driven: Sequence[int]) -> list[int]:
-    """Actuators of the robot's ``arm_joints``, where each actuator drives a joint by its index in ``joint_names``."""
+    """Actuators of the robot's ``arm_joints``; ``driven`` are the indices of the actuators' joints."""
     return [[*driven].index(robot.joint_names.index(name)) for name in robot.arm_joints]
 
 
@@ -114,35 +103,27 @@ def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix.reshape(3, 3)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drives:
+class Drives(NamedTuple):
     """Position drives of a robot's joints; arrays have a row a joint."""
 
-    stiffness: NDArray[np.float64]
-    """Position gain [N m/rad]; 0 without a position actuator."""
-    damping: NDArray[np.float64]
-    """Velocity gain [N m s/rad]."""
-    effort: NDArray[np.float64]
-    """Largest torque [N m]; inf without a limit."""
-    targets: NDArray[np.float64]
-    """Range of targets [rad], shape (num_joints, 2); NaN without one."""
-    followers: frozenset[int]
-    """Joints without a drive, which an equality lets follow others."""
+    stiffness: NDArray[np.float64]  # position gain [N m/rad]; 0 without a position actuator
+    damping: NDArray[np.float64]  # velocity gain [N m s/rad]
+    effort: NDArray[np.float64]  # largest torque [N m]; inf without a limit
+    targets: NDArray[np.float64]  # range of targets [rad], shape (num_joints, 2); NaN without one
+    followers: frozenset[int]  # joints without a drive, which an equality lets follow others
 
 
 def read_drives(model: Any) -> Drives:
     """Reads the actuators of a compiled file that has no :func:`drive_problems`."""
-    count = model.njnt - 1
-    stiffness, damping = np.zeros((2, count))
-    effort = np.full(count, np.inf)
-    targets = np.full((count, 2), np.nan)
+    stiffness, damping = np.zeros((2, model.njnt - 1))
+    effort = np.full(model.njnt - 1, np.inf)
+    targets = np.full((model.njnt - 1, 2), np.nan)
     for joint, _, span, scale in _torque_ranges(model):
         effort[joint] = min(effort[joint], scale * float(span[1]))
     for k in range(model.nu):
         if _actuator_kind(model, k) == "position":
             joint = _driven_joint(model, k)
-            stiffness[joint] = model.actuator_gainprm[k, 0]
-            damping[joint] = -model.actuator_biasprm[k, 2]
+            stiffness[joint], damping[joint] = model.actuator_gainprm[k, 0], -model.actuator_biasprm[k, 2]
             if model.actuator_ctrllimited[k]:
                 targets[joint] = model.actuator_ctrlrange[k]
     return Drives(stiffness=stiffness, damping=damping, effort=effort, targets=targets, followers=_followers(model))
@@ -152,19 +133,15 @@ def drive_problems(spec: Any, model: Any) -> Iterator[str]:
     """What no position drive can do, with its line in the file."""
     driven = set[int]()
     for k, actuator in enumerate(spec.actuators):
-        line = f"on {actuator.target} ({actuator.info})"
-        joint = _driven_joint(model, k)
-        kind = _actuator_kind(model, k)
-        if joint < 0:
-            yield f"an actuator that moves no joint {line}"
-        elif kind not in ("position", "motor"):
-            yield f"{kind} {line}"
-        elif joint in driven:
-            yield f"a second actuator {line}"
-        elif joint in _followers(model):
-            yield f"a drive of a joint that follows another {line}"
-        elif kind == "position" and model.actuator_gear[k, 0] != 1.0:
-            yield f"a gear other than 1 on a position actuator {line}"
+        joint, kind = _driven_joint(model, k), _actuator_kind(model, k)
+        checks = {
+            "an actuator that moves no joint": joint < 0,
+            kind: kind not in ("position", "motor"),
+            "a second actuator": joint in driven,
+            "a drive of a joint that follows another": joint in _followers(model),
+            "a gear other than 1 on a position actuator": kind == "position" and model.actuator_gear[k, 0] != 1.0,
+        }
+        yield from [f"{what} on {actuator.target} ({actuator.info})" for what in checks if checks[what]][:1]
         driven.add(joint)
     for joint, name, (low, high), _ in _torque_ranges(model):
         if low != -high:
@@ -199,8 +176,7 @@ def _actuator_kind(model: Any, k: int) -> str:
         return "an actuator of a plugin"
     if model.actuator_dyntype[k]:
         return "an actuator with a timeconst or other dynamics"
-    gain = model.actuator_gainprm[k]
-    bias = model.actuator_biasprm[k]
+    gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
     is_fixed = model.actuator_gaintype[k] == mj.mjtGain.mjGAIN_FIXED
     is_affine = is_fixed and model.actuator_biastype[k] == mj.mjtBias.mjBIAS_AFFINE and not bias[0]
     if is_fixed and model.actuator_biastype[k] == mj.mjtBias.mjBIAS_NONE and not gain[1:].any():
@@ -237,23 +213,17 @@ def set_drives(spec: Any, drives: Drives, robot: RobotCfg) -> None:
         actuator.ctrlrange = np.nan_to_num(drives.targets[k])
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotFile:
+class RobotFile(NamedTuple):
     """Content of a robot's file, without its settings."""
 
-    spec: Any
-    """The ``MjSpec``, stripped to what simulations use; every touching geom has a name."""
+    spec: Any  # the ``MjSpec``, stripped to what simulations use; every touching geom has a name
     model: Any
-    home: list[float] | None
-    """Joint angles of its keyframe ``home`` [rad]; None without one."""
+    home: list[float] | None  # joint angles of its keyframe ``home`` [rad]; None without one
     is_urdf: bool
 
 
 def robot_spec(robot: RobotCfg, *, visuals: bool = False) -> Any:
-    """The robot as an ``MjSpec`` that compiles; an error says all that is wrong with its file or its settings.
-
-    Gains, torque limits, armature and contact of the settings count first. With ``visuals`` a URDF keeps what it shows.
-    """
+    """The robot as an ``MjSpec`` that compiles, or all that is wrong; with ``visuals`` a URDF keeps what it shows."""
     robot_file = read_robot_file(robot.model_file, visuals=visuals)
     if problems := file_problems(robot, robot_file):
         raise ValueError(f"robot '{robot.name}': {'; '.join(problems)}")
@@ -450,20 +420,18 @@ def _structure_problems(model: Any) -> Iterator[str]:
             yield f"inertia of body {model.body(k).name} is that of a point: give it that of a body [kg m^2]"
 
 
-def _missing(kind: str, names: Sequence[str], present: Sequence[str], robot: RobotCfg) -> list[str]:
-    missing = ", ".join(name for name in names if name not in present)
-    return [f"no {kind} named {missing} in {robot.model_file}: the file has {', '.join(present)}"] if missing else []
-
-
 def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
     """Complaints about settings that do not fit the robot's file: names, and values for each joint."""
     model, drives, names = file.model, read_drives(file.model), robot.joint_names
     geoms = [geom.name for geom in touching_geoms(*file.spec.bodies)]
-    no_geom = _missing("geom that touches the ground is", robot.geom_names, geoms, robot)
+    kinds = {"joint": (names, joint_names(model)), "geom that touches the ground": (robot.geom_names, geoms)}
+    unknown = []
+    for kind, (given, present) in kinds.items():
+        if missing := ", ".join(name for name in given if name not in present):
+            unknown.append(f"no {kind} is named {missing} in {robot.model_file}: the file has {', '.join(present)}")
     if names != joint_names(model):
-        no_joint = _missing("joint is", names, joint_names(model), robot)
         order = f"joint_names must follow the file's order {joint_names(model)}, got {names}"
-        return [*(no_joint or [order]), *no_geom]
+        return unknown if {*names} - {*joint_names(model)} else [order, *unknown]
     problems = []
     for field in PER_JOINT:
         values = getattr(robot, field)
@@ -479,14 +447,12 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
         beyond = np.flatnonzero(~((low - _SLACK <= pose) & (pose <= high + _SLACK)))
         if len(beyond):
             listed = ", ".join(f"{names[k]} ({low[k]:g} to {high[k]:g}, got {pose[k]:g})" for k in beyond)
-            degrees = ": angles are in radians" if np.abs(pose).max() > 2.0 * np.pi else ""
-            problems.append(f"default_joint_pos is outside of the file's range for {listed}{degrees}")
+            problems.append(f"default_joint_pos is outside of the file's range for {listed}: angles are in radians")
     limitless = ", ".join(name for name, effort in zip(names, drives.effort, strict=True) if np.isinf(effort))
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
         problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")
     gains = drives.stiffness if robot.stiffness is None else robot.stiffness
-    limp = [k for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers)]
+    limp = ", ".join(names[k] for k, gain in enumerate(gains) if not (gain > 0.0 or k in drives.followers))
     if limp and not problems and robot.actuator_net is None:
-        listed = ", ".join(names[k] for k in limp)
-        problems.append(f"no gains for {listed}: give stiffness and damping, or <position> in {robot.model_file}")
-    return [*problems, *no_geom]
+        problems.append(f"no gains for {limp}: give stiffness and damping, or <position> in {robot.model_file}")
+    return [*problems, *unknown]

@@ -12,16 +12,11 @@ from sim.files.command import command_line
 from sim.files.settings import PositiveFloat
 from sim.robots.robot import ROBOTS, RobotCfg, check_robot_identity
 
-STRAY = {False: "stray_m", True: "stray_resolved_m"}
-"""Keys of penalty scales, by whether contact is resolved: how far a route may be missed [m]."""
+STRAY = {False: "stray_m", True: "stray_resolved_m"}  # keys of scales: how far a route may be missed [m]
 
 
 def get_robot(spec: str | RobotCfg | None) -> RobotCfg:
-    """Settings of a robot that the command line names; :func:`resolve_robot` is for what a file names.
-
-    It names a shipped robot, or the file of another: a robot.toml, or Python, which is run and must set ``ROBOT``. None
-    is ANYmal; settings are returned as they are.
-    """
+    """The robot that the command line names: a shipped one, ANYmal for None, or a file, of which Python is run."""
     if isinstance(spec, RobotCfg):
         return spec
     spec = spec or "anymal"
@@ -36,12 +31,7 @@ def get_robot(spec: str | RobotCfg | None) -> RobotCfg:
 
 
 def resolve_robot(record: Mapping[str, Any], given: str | RobotCfg | None, file: Path, kind: str = "run") -> RobotCfg:
-    """The robot that a file names, for example a run's, if it has not changed since.
-
-    A shipped robot is known by its name. Any other must be named on the command line too: no code runs that only a
-    file names. The record has the keys of :func:`sim.robots.robot.robot_identity`; ``given`` is what the command
-    names, if anything; errors name the file and its ``kind``.
-    """
+    """The robot of a file's record, if unchanged; one that is not shipped must be ``given``: a record runs no code."""
     name = record["robot"]
     if given is None and name not in ROBOTS:
         raise ValueError(f"{file} is of robot '{name}', which is not shipped: name its settings file too, by --robot")
@@ -59,9 +49,8 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
     remedy = f"run `{command_line('archive', robot=robot.spec, policy=policy)}`, which measures them first"
     if policy is None and not robot.policy_file.exists():
         remedy = f"train its controller first with `{robot.train_command}`, or name one with --policy; then {remedy}"
-    if not robot.scales_file.exists():
+    if not (content := _read_scales(robot)):
         raise ValueError(f"no penalty scales of robot '{robot.name}': expected {robot.scales_file}; {remedy}")
-    content = read_json(robot.scales_file)
     check_robot_identity(content, robot, robot.scales_file, remedy)
     try:
         scales = msgspec.convert(content.get("scales"), dict[str, PositiveFloat])
@@ -72,11 +61,8 @@ def read_penalty_scales(robot: RobotCfg, policy: str | None = None) -> tuple[flo
 
 
 def read_stray(robot: RobotCfg, *, resolved: bool = False) -> float:
-    """How far a displacement over two seconds may lie from the one that a route commands [m] (``qd.check``).
-
-    It is that of the search's physics, or with contact ``resolved``: robots walk a little slower or faster then.
-    """
-    content, key = read_json(robot.scales_file) if robot.scales_file.exists() else {}, STRAY[resolved]
+    """How far a displacement over two seconds may lie from the one that a route commands [m] (``qd.check``)."""
+    content, key = _read_scales(robot), STRAY[resolved]
     if key not in content:
         remedy = f"run `{command_line('archive', robot=robot.spec, space='super_gaussian+command')}`"
         raise ValueError(f"{robot.scales_file} must say how far a route may be missed, got no {key}: {remedy} first")
@@ -85,17 +71,16 @@ def read_stray(robot: RobotCfg, *, resolved: bool = False) -> float:
 
 def fitting_space(robot: RobotCfg) -> str | None:
     """The terrain space that the robot's scales were measured on, whose height fits it; None of a shipped robot."""
-    if robot.settings_file is None or not robot.scales_file.exists():
-        return None
-    return read_json(robot.scales_file).get("space")
+    return None if robot.settings_file is None else _read_scales(robot).get("space")
 
 
 def scaled_by_another(robot: RobotCfg, policy: str) -> str | None:
-    """A note on a search whose controller is not that of the robot's scales; None if it is.
-
-    This is no mistake: common scales make searches against different controllers comparable.
-    """
-    measured = read_json(robot.scales_file) if robot.scales_file.exists() else {}
+    """A note on a search whose controller is not that of the robot's scales, which is no mistake; None if it is."""
+    measured = _read_scales(robot)
     if measured.get("policy_sha256") in (None, controller_hash(policy)):
         return None
     return f"Penalties are scaled by those of {measured.get('policy')}, with which {robot.scales_file} was measured."
+
+
+def _read_scales(robot: RobotCfg) -> dict[str, Any]:
+    return read_json(robot.scales_file) if robot.scales_file.exists() else {}

@@ -20,11 +20,7 @@ _vec2: Any = wp.vec2
 
 
 def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
-    """One robot as a Newton builder, ready to be replicated into worlds.
-
-    Visual shapes are left out, bodies that are fixed to each other are one. Collision shapes of a URDF are called as
-    their link, with a number from 0 behind where it has several (``LF_SHANK_0``).
-    """
+    """One robot as a Newton builder without visual shapes, ready to be replicated into worlds."""
     return make_builder(robot_spec(robot).compile())
 
 
@@ -68,15 +64,13 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
     axes = rotation_matrix(model.body_iquat[body])
     inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
     pose = _transform(model.body_pos[body], model.body_quat[body])
+    masses = {"mass": float(model.body_mass[body]), "inertia": wp.mat33(*map(float, inertia.ravel()))}
     centre = wp.vec3(*map(float, model.body_ipos[body]))
-    moments = wp.mat33(*map(float, inertia.ravel()))
-    inertial = {"mass": float(model.body_mass[body]), "com": centre, "inertia": moments, "lock_inertia": True}
-    link = builder.add_link(xform=pose, label=model.body(body).name, **inertial)
+    link = builder.add_link(xform=pose, label=model.body(body).name, com=centre, lock_inertia=True, **masses)
     joint = int(model.body_jntadr[body])
     dof = int(model.jnt_dofadr[joint])
-    name = model.joint(joint).name
     if body == 1:
-        base = builder.add_joint_free(child=link, label=name)
+        base = builder.add_joint_free(child=link, label=model.joint(joint).name)
         for ours, theirs in _PASSIVE.items():
             getattr(builder, f"joint_{ours}")[:6] = getattr(model, f"dof_{theirs}")[:6].tolist()
         return base
@@ -99,7 +93,7 @@ def _add_body(builder: newton.ModelBuilder, model: Any, body: int) -> int:
         limit_upper=float(limits[1]),
         effort_limit=effort,
         **{ours: float(getattr(model, f"dof_{theirs}")[dof]) for ours, theirs in _PASSIVE.items()},
-        label=name,
+        label=model.joint(joint).name,
         custom_attributes={
             "mujoco:solreflimit": _vec2(*model.jnt_solref[joint]),
             "mujoco:solreflimit_mode": _RAW_SOLREF,
@@ -116,10 +110,8 @@ def _vector(values: NDArray[np.float64]) -> Any:
 
 
 def _add_geom(builder: newton.ModelBuilder, model: Any, geom: int) -> None:
-    """Adds a shape that touches the ground."""
     kind = mj.mjtGeom(int(model.geom_type[geom]))
-    source = None
-    scale = model.geom_size[geom]
+    source, scale = None, model.geom_size[geom]
     if kind == mj.mjtGeom.mjGEOM_MESH:
         vertices, faces = read_mesh(model, geom)
         source, scale = newton.Mesh(vertices, faces.ravel(), compute_inertia=False), (1.0, 1.0, 1.0)

@@ -1,27 +1,23 @@
 """The files that a robot's model is read from: MJCF or URDF, what it includes, and its meshes."""
 
+import importlib
 import os
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 _PACKAGE = "package://"
-MENAGERIE = "menagerie:"
-"""What a model of MuJoCo Menagerie begins with."""
+MENAGERIE = "menagerie:"  # what a model of MuJoCo Menagerie begins with
 _SUFFIXES = (".stl", ".obj", ".msh", ".xml", ".mjcf", ".png")  # .msh: MuJoCo's own
 
 
-@dataclass(frozen=True, kw_only=True)
-class ModelFiles:
+class ModelFiles(NamedTuple):
     """A model file, read but not built."""
 
-    root: ET.Element
-    """Root of the XML; in a URDF the meshes' file names are absolute."""
-    files: tuple[Path, ...]
-    """The model file, included and attached files, meshes and textures."""
+    root: ET.Element  # root of the XML; in a URDF the meshes' file names are absolute
+    files: tuple[Path, ...]  # the model file, included and attached files, meshes and textures
 
     @property
     def is_urdf(self) -> bool:
@@ -30,10 +26,7 @@ class ModelFiles:
 
 
 def find_model(name: str | Path, folder: Path = Path()) -> Path:
-    """The file of a model: a path below ``folder``, or ``menagerie:unitree_go2``, a robot of MuJoCo Menagerie.
-
-    ``menagerie:unitree_go2/go2_mjx`` is another of its models. The menagerie's package downloads a robot once.
-    """
+    """The file of a model: a path below ``folder``, ``menagerie:unitree_go2``, or ``menagerie:unitree_go2/go2_mjx``."""
     robot_name, _, model_name = str(name).removeprefix(MENAGERIE).partition("/")
     if not str(name).startswith(MENAGERIE):
         return folder / name
@@ -49,10 +42,9 @@ def find_model(name: str | Path, folder: Path = Path()) -> Path:
 
 
 def find_above(name: str, folder: Path) -> Path | None:
-    """The file that a file of ``folder`` names, in this folder or in one above; None if it is not there.
+    """The file that a file of ``folder`` names, there, or above if its name has a folder; None if it is not there.
 
-    What stands for a folder is left out: ``{LEGGED_GYM_ROOT_DIR}/``, ``package://``, a package's name. A name without a
-    folder is looked for in ``folder`` alone.
+    ``{LEGGED_GYM_ROOT_DIR}/``, ``package://`` and a package's name are left out.
     """
     path = Path(re.sub(r"^(\{\w+\}/|package://)", "", name))
     paths = [path, Path(*path.parts[1:])] if name.startswith(_PACKAGE) else [path]
@@ -78,15 +70,12 @@ def _parse_xml(model_file: Path) -> ET.Element:
 
 
 def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
-    """Reads an MJCF or URDF and looks for the files that it names.
-
-    With ``visuals`` a URDF keeps the visuals of its links that are primitives or existing meshes of a known format.
-    """
+    """Reads an MJCF or URDF and looks for the files that it names; with ``visuals`` a URDF keeps those it can show."""
     root = _parse_xml(model_file)
     if root.tag not in ("mujoco", "robot"):
         raise ValueError(f"{model_file} must be an MJCF (<mujoco>) or a URDF (<robot>), got <{root.tag}>")
-    visual_elements = [(parent, visual) for parent in root.iter() for visual in parent.findall("visual")]
-    for parent, visual in visual_elements if root.tag == "robot" else ():
+    elements = [(parent, visual) for parent in root.iter() for visual in parent.findall("visual")]
+    for parent, visual in elements if root.tag == "robot" else ():
         if not (visuals and _can_be_shown(visual, model_file)):  # meshes are often in formats that need more packages
             parent.remove(visual)
     for element in root.iter():
@@ -103,7 +92,6 @@ def read_model_files(model_file: Path, *, visuals: bool = False) -> ModelFiles:
 
 
 def _urdf_files(root: ET.Element, model_file: Path) -> list[Path]:
-    """A URDF and its meshes, whose names become absolute."""
     if problems := [f"{model_file}: {problem}" for problem in _urdf_problems(root)]:
         raise ValueError("; ".join(problems))
     files = [model_file]
@@ -158,9 +146,7 @@ def _mesh_path(mesh: ET.Element, model_file: Path) -> Path:
 
 def _mjcf_files(model_file: Path) -> list[Path]:
     """An MJCF and what it names, as MuJoCo looks for it: in its own folder first, then beside what it includes."""
-    import mujoco  # takes long to load: not for the help of commands
-
-    mj: Any = mujoco  # its types are not written down
+    mj: Any = importlib.import_module("mujoco")  # takes long to load: not for the help of commands
     try:
         named = sorted(map(Path, mj.mju_getXMLDependencies(os.path.abspath(model_file))))
     except mj.FatalError as error:

@@ -1,13 +1,9 @@
-"""Collision shapes as strips of sphere probes, close enough that no terrain edge slips between two of them.
-
-A mesh is covered by balls that touch its convex hull from inside.
-"""
+"""Collision shapes as strips of sphere probes, so close that no terrain edge slips through; meshes as convex hulls."""
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import newton
 import numpy as np
@@ -26,23 +22,18 @@ _BUNDLE = 8  # strips, few enough that one thread looks at all
 _vec3: Any = wp.vec3
 
 
-@dataclass(frozen=True, kw_only=True)
-class Strip:
+class Strip(NamedTuple):
     """A row of equal spheres on one shape, straight except on meshes."""
 
-    centres: np.ndarray
-    """Centres in the shape's frame [m], shape (num_probes, 3), in order along the strip."""
-    radius: float
-    """Probe radius [m]."""
-    spread: float = 0.0
-    """Farthest that a centre lies from the straight line between the first and the last one [m]."""
+    centres: np.ndarray  # centres in the shape's frame [m], shape (num_probes, 3), in order along the strip
+    radius: float  # probe radius [m]
+    spread: float = 0.0  # farthest that a centre lies from the straight line between the first and the last one [m]
 
 
 _MESH_TOLERANCE = 0.01  # farthest that a point of a hull's surface may lie outside of the nearest probe [m]
 _SMALL_MESH_SHARE = 1.0 / 12.0  # of a small mesh's longest side, its tolerance
 _MAX_PROBE_RADIUS = 0.1  # [m]
-MAX_MESH_PROBES = 400
-"""Probes of one mesh; one that would need more is covered as closely as these reach."""
+MAX_MESH_PROBES = 400  # probes of one mesh; one that would need more is covered as closely as these reach
 _WIDE = 0.1  # a wider mesh lies on two rows of probes, left and right [m]
 _SAMPLES_PER_TOLERANCE = 2.0
 _GROWTH = 1.25
@@ -81,8 +72,7 @@ def _cover(triangles: _Array, planes: _Array, inradius: float, tolerance: float)
     goal = tolerance - spacing / np.sqrt(3.0)
     largest = min(inradius, _MAX_PROBE_RADIUS)
     radii = largest * 0.5 ** np.arange(max(1.0, np.ceil(np.log2(8.0 * largest / tolerance))))
-    squares = (samples * samples).sum(axis=1)
-    gap = np.full(len(samples), np.inf)
+    squares, gap = (samples * samples).sum(axis=1), np.full(len(samples), np.inf)
     balls: list[tuple[_Array, float]] = []
     while gap.max() > goal:
         if len(balls) == MAX_MESH_PROBES:
@@ -115,11 +105,7 @@ def _rows(centres: _Array, radii: _Array, corners: _Array) -> Iterator[Strip]:
 
 @lru_cache(maxsize=64)
 def hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
-    """Probes of the convex hull of vertices [m], float64 of shape (num_vertices, 3), and their tolerance [m].
-
-    Rows are of one radius, in order along the mesh's longest side, and not straight. No probe sticks out; every point
-    of the hull's surface lies at most the tolerance outside of the nearest one.
-    """
+    """Probes in the convex hull of vertices [m], float64 (num_vertices, 3), and how far outside its surface lies."""
     try:
         hull = ConvexHull(np.frombuffer(vertices).reshape(-1, 3))
     except QhullError:
@@ -137,10 +123,8 @@ def hull_probes(vertices: bytes) -> tuple[list[Strip], float]:
     return [*_rows(*balls, corners)], tolerance
 
 
-MAX_SAG = 0.005
-"""Deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]."""
-CAPSULE_SAG = 0.0005
-"""Deepest that it may sink between those of a capsule [m]: limbs stand, slide and hang on edges with them."""
+MAX_SAG = 0.005  # deepest that a sharp ridge may sink between two neighbouring probes of a box or cylinder [m]
+CAPSULE_SAG = 0.0005  # deepest that it may sink between those of a capsule, by which limbs hang on edges [m]
 _MAX_EDGE_RADIUS = 0.02  # largest probe radius on boxes and cylinders, whose edges the probes round off [m]
 _MAX_SIDE = 10.0  # longest side of a shape [m]; a longer one is in other units
 
@@ -166,10 +150,7 @@ def capsule_strips(radius: float, half_height: float) -> list[Strip]:
 
 
 def box_strips(*half: float) -> Iterator[Strip]:
-    """Parallel strips under the whole surface of a box, along its longest side (z of a cube).
-
-    Edges and corners are rounded by at most 2 cm; faces are exact at every probe.
-    """
+    """Strips under the whole surface of a box, along its longest side; edges are rounded by at most 2 cm."""
     radius = min(_MAX_EDGE_RADIUS, *half)
     spacing = _max_spacing(radius)
     # Contacts are made of the ends of a strip, so the fewer strips, the fewer contacts of a box that lies.
@@ -205,10 +186,7 @@ _PRIMITIVES: dict[newton.GeoType, tuple[int, Callable[..., Iterable[Strip]]]] = 
 
 
 def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None) -> list[Strip]:
-    """Strips of one collision shape, in the shape's frame; a mesh collides as its convex hull.
-
-    ``scale`` is Newton's: (radius,), (radius, half height) or (half x, half y, half z) [m]; factors x, y, z of a mesh.
-    """
+    """Strips of one collision shape of Newton's scale, in the shape's frame; a mesh collides as its convex hull."""
     num_sizes, make_strips = _PRIMITIVES.get(shape_type, (0, None))
     sizes = np.asarray(scale, dtype=np.float64)[:num_sizes]
     is_mesh = shape_type == newton.GeoType.MESH
@@ -218,12 +196,12 @@ def shape_strips(shape_type: newton.GeoType, scale: np.ndarray, mesh: Any = None
     longest = max(2.0 * sizes.max(initial=0.0), float(np.ptp(vertices, axis=0).max()))
     if not longest <= _MAX_SIDE:
         raise ValueError(f"it is {longest:g} m long, more than {_MAX_SIDE:g} m: give lengths in m, a mesh its scale")
-    if make_strips is not None:
-        return [*make_strips(*map(float, sizes))]
     if is_mesh:
         return hull_probes(vertices.tobytes())[0]
-    kind = newton.GeoType(shape_type).name
-    raise ValueError(f"it must be a SPHERE, CAPSULE, BOX, CYLINDER or MESH, got {kind}: replace it in the robot's file")
+    if make_strips is None:
+        kind = newton.GeoType(shape_type).name
+        raise ValueError(f"it must be a SPHERE, CAPSULE, BOX, CYLINDER or MESH, got {kind}: replace it in the file")
+    return [*make_strips(*map(float, sizes))]
 
 
 def make_probes(builder: newton.ModelBuilder) -> Probes:
@@ -241,8 +219,7 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
         raise ValueError("; ".join(problems))
     poses: Any = builder.shape_transform
     centres = [[wp.transform_point(poses[k], _vec3(*centre)) for centre in strip.centres] for k, strip in strips]
-    shape = [k for k, _ in strips]
-    radius = [strip.radius for _, strip in strips]
+    shape, radius = [k for k, _ in strips], [strip.radius for _, strip in strips]
     body = [builder.shape_body[k] for k in shape]
     runs = (list(run) for _, run in itertools.groupby(range(len(body)), body.__getitem__))
     bundles = [first for run in runs for first in run[::_BUNDLE]] + [len(body)]  # neighbours on one body
@@ -268,10 +245,7 @@ def _bounding_ball(strips: Sequence[Sequence[Any]], radii: Sequence[float]) -> t
 
 
 def start_height(robot: RobotCfg, builder: newton.ModelBuilder) -> float:
-    """Height of the base over flat ground at which a crossing starts with no foot in the ground [m], to the next mm.
-
-    Crossings start with every joint up to a fifth from its default angle.
-    """
+    """Height of the base at which a crossing, whose joints start about their angles, has no foot in the ground [m]."""
     spread = CrossingCfg().start_joint_range
     scale = np.random.default_rng(0).uniform(1.0 - spread, 1.0 + spread, (_DRAWS, robot.num_joints))
     scale[0] = 1.0

@@ -11,13 +11,12 @@ import numpy as np
 from msgspec import Meta
 
 from sim.files.command import command_line
-from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from sim.files.settings import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, from_builtins, read_toml
 from sim.robots.model_files import read_model_files
-from sim.robots.training import LearningCfg, PaperCfg, RewardCfg, TrainingCfg, TuningCfg
+from sim.robots.training import LearningCfg, PaperCfg, TrainingCfg, TuningCfg
 
 _ROBOTS_DIR = Path(__file__).parent  # of the files of the shipped robots
-PENALTY_DEFINITION = "squared"
-"""How yaw_rate, vel_x and vel_y of :mod:`kernels.penalties` measure an error; records by another are not read."""
+PENALTY_DEFINITION = "squared"  # how yaw_rate, vel_x and vel_y measure an error; records by another are not read
 SENSES = {"pose": ("heading", "yaw", "quat", "base_pos"), "contacts": ("contacts",), "torques": ("torques",)}
 """What a robot may sense beside the usual row, and terms of a controller's observation that need it."""
 _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning", "label", "paper")
@@ -25,109 +24,64 @@ _NOT_IN_DIGEST = ("model_file", "settings_file", "training", "learning", "tuning
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorNetCfg:
-    """A network of all drives, from target less position [rad] and velocity [rad/s] to torque [N m].
+    """A network of all drives, from target less position [rad] and velocity [rad/s] to torque [N m], as Isaac Lab's."""
 
-    Names are Isaac Lab's. ``file`` is TorchScript, relative to the robot's settings. A torque is held for
-    ``decimation`` physics steps.
-    """
-
-    file: Path
+    file: Path  # TorchScript, relative to the robot's settings
     pos_scale: float = 1.0
     vel_scale: float = 1.0
     torque_scale: float = 1.0
     input_order: Literal["pos_vel", "vel_pos"] = "pos_vel"
-    input_idx: tuple[NonNegativeInt, ...] = ()
-    """Evaluations ago of which dense layers see error and velocity; if empty, the last ones, the newest first."""
-    decimation: PositiveInt = 1
+    input_idx: tuple[NonNegativeInt, ...] = ()  # evaluations ago that dense layers see; if empty the last ones
+    decimation: PositiveInt = 1  # physics steps for which a torque is held
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotCfg:
-    """What the simulation and the search need to know of a robot beside its model file.
+    """What simulation, search and training need to know of a robot beside its model; x forward, y left, z up."""
 
-    Base frame: x forward, y left, z up. Gains, effort limits and armature of the shipped robots stand in their MJCF
-    (position actuators), so that any MuJoCo reads the same robot.
-    """
-
-    name: str
-    """Name of its files and folders."""
-    model_file: Path
-    """MJCF, whose first body has the free joint, or URDF; relative to the settings' file."""
-    base_geoms: tuple[str, ...]
-    """Geoms whose touch ends an episode."""
-    foot_geoms: tuple[str, ...]
-    """Geoms it walks on."""
-    limb_geoms: tuple[str, ...]
-    """Geoms whose touch is penalised, beside the base's."""
-    joint_names: tuple[str, ...]
-    """Actuated joints in policy order, which is the file's order."""
-    default_joint_pos: tuple[float, ...]
-    """Default pose [rad]; an action of 0 holds it."""
-    default_base_height: NonNegativeFloat = 0.0
-    """Height of the base over flat ground at the start [m]; if 0, the lowest one with no foot in the ground."""
-    footprint: tuple[PositiveFloat, PositiveFloat]
-    """Half length and half width of the stance [m]."""
-    scan_x: tuple[float, ...]
-    """Height-scan points ahead of the base, yaw frame [m]."""
-    scan_y: tuple[float, ...]
-    """Height-scan points left of the base, yaw frame [m]."""
-    contact_force_limit: PositiveFloat
-    """Contact force of a foot beyond which it is penalised [N]."""
-    penalties: tuple[str, ...]
-    """Raw penalties that count, a subset of :data:`kernels.penalties.PENALTIES`."""
-    collision_bit: bool
-    """Whether base collision is a descriptor of its own (the paper: Cassie)."""
-    senses: tuple[Literal["pose", "contacts", "torques"], ...] = ()
-    """What stands after the scan in the observation row: :data:`kernels.observation` says it."""
-    arm_joints: tuple[str, ...] = ()
-    """Joints of arms, which its controller does not move; the conditions of ``+arms`` do."""
-    action_scale: PositiveFloat = 0.5
-    """Radians per unit of action."""
+    name: str  # name of its files and folders
+    model_file: Path  # MJCF, whose first body has the free joint, or URDF; relative to the settings' file
+    base_geoms: tuple[str, ...]  # geoms whose touch ends an episode
+    foot_geoms: tuple[str, ...]  # geoms it walks on
+    limb_geoms: tuple[str, ...]  # geoms whose touch is penalised, beside the base's
+    joint_names: tuple[str, ...]  # actuated joints in policy order, which is the file's order
+    default_joint_pos: tuple[float, ...]  # default pose [rad]; an action of 0 holds it
+    default_base_height: NonNegativeFloat = 0.0  # at the start [m]; if 0, the lowest one with no foot in the ground
+    footprint: tuple[PositiveFloat, PositiveFloat]  # half length and half width of the stance [m]
+    scan_x: tuple[float, ...]  # height-scan points ahead of the base, yaw frame [m]
+    scan_y: tuple[float, ...]  # height-scan points left of the base, yaw frame [m]
+    contact_force_limit: PositiveFloat  # contact force of a foot beyond which it is penalised [N]
+    penalties: tuple[str, ...]  # raw penalties that count, a subset of :data:`kernels.penalties.PENALTIES`
+    collision_bit: bool  # whether base collision is a descriptor of its own (the paper: Cassie)
+    senses: tuple[Literal["pose", "contacts", "torques"], ...] = ()  # after the scan: :mod:`kernels.observation`
+    arm_joints: tuple[str, ...] = ()  # that its controller does not move; the conditions of ``+arms`` do
+    action_scale: PositiveFloat = 0.5  # radians per unit of action
     physics_dt: Annotated[float, Meta(gt=0, le=0.05)] = 0.005
-    decimation: Annotated[int, Meta(ge=1, le=1000)] = 4
-    """Physics steps per control step."""
-    speed: PositiveFloat = 0.75
-    """Commanded speed of a crossing, toward the goal [m/s]."""
-    max_duration_s: PositiveFloat = 20.0
-    """Time after which a crossing ends [s]; the goal is 12 m away."""
-    max_speed: PositiveFloat = 100.0
-    """A state with a larger velocity is invalid [m/s or rad/s]: no robot reaches it, not even in a fall."""
-    nconmax: PositiveInt = 40
-    """Largest number of contacts of a robot with the ground."""
-    stiffness: tuple[PositiveFloat, ...] | None = None
-    """Position gain of each joint [N m/rad], for a URDF or an MJCF without position actuators; the file's if None."""
-    damping: tuple[NonNegativeFloat, ...] | None = None
-    """Velocity gain of each joint [N m s/rad], together with ``stiffness``."""
-    effort_limit: tuple[PositiveFloat, ...] | None = None
-    """Largest torque of each joint [N m]; the file's if None, and never more than that of its actuators."""
-    armature: tuple[NonNegativeFloat, ...] | None = None
-    """Inertia of each joint's rotor, behind its gears [kg m^2]; the file's if None."""
-    saturation_effort: tuple[PositiveFloat, ...] | None = None
-    """Stall torque of each joint's DC motor [N m], together with ``velocity_limit``; None for ideal PD.
-
-    The motor is Isaac Lab's ``DCMotor`` since its pull request 2300: at a joint velocity v the torque of the PD gains
-    is clipped to saturation * (-1 - v / limit) and saturation * (1 - v / limit), and these to the effort limit, which
-    may be more or less. So beyond the speed limit a motor brakes, whatever its target.
-    """
-    velocity_limit: tuple[PositiveFloat, ...] | None = None
-    """Speed of each joint at which its motor has no torque left [rad/s]."""
-    actuator_net: ActuatorNetCfg | None = None
-    """Network in place of PD gains; its torque is clipped as theirs is."""
-    drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0
-    """Physics steps by which joint targets are late. Until the first one arrives, the default pose is held."""
-    friction: PositiveFloat | None = None
-    """Sliding friction of all geoms; the file's if None, 1 of a URDF. Less than the ground's .3 counts as .3."""
-    contact_time_constant_s: PositiveFloat | None = None
-    """Contact time constant of all geoms [s]; the file's if None, .01 of a URDF. At least twice the physics step."""
+    decimation: Annotated[int, Meta(ge=1, le=1000)] = 4  # physics steps per control step
+    speed: PositiveFloat = 0.75  # commanded speed of a crossing, toward the goal [m/s]
+    max_duration_s: PositiveFloat = 20.0  # time after which a crossing ends [s]; the goal is 12 m away
+    max_speed: PositiveFloat = 100.0  # a larger velocity is invalid [m/s or rad/s]: no robot reaches it in a fall
+    nconmax: PositiveInt = 40  # largest number of contacts of a robot with the ground
+    # Of each joint; the file's if None. A URDF, or an MJCF without position actuators, needs stiffness and damping.
+    stiffness: tuple[PositiveFloat, ...] | None = None  # position gain [N m/rad]
+    damping: tuple[NonNegativeFloat, ...] | None = None  # velocity gain [N m s/rad]
+    effort_limit: tuple[PositiveFloat, ...] | None = None  # largest torque [N m], never more than the actuators'
+    armature: tuple[NonNegativeFloat, ...] | None = None  # inertia of the rotor, behind its gears [kg m^2]
+    # Isaac Lab's DCMotor since its pull request 2300; None for ideal PD. At a joint velocity v, the torque of the gains
+    # is clipped to saturation * (-1 - v / limit) and saturation * (1 - v / limit), and these to the effort limit, which
+    # may be more or less. So beyond the speed limit a motor brakes, whatever its target.
+    saturation_effort: tuple[PositiveFloat, ...] | None = None  # stall torque [N m]
+    velocity_limit: tuple[PositiveFloat, ...] | None = None  # speed without torque [rad/s]
+    actuator_net: ActuatorNetCfg | None = None  # network in place of PD gains; its torque is clipped as theirs is
+    drive_delay_steps: Annotated[int, Meta(ge=0, le=1000)] = 0  # physics steps by which joint targets are late
+    friction: PositiveFloat | None = None  # of all geoms, sliding, at least .3; the file's if None, 1 of a URDF
+    contact_time_constant_s: PositiveFloat | None = None  # of all geoms [s]; the file's if None, .01 of a URDF
     training: TrainingCfg = field(default_factory=TrainingCfg)
     learning: LearningCfg = field(default_factory=LearningCfg)
     tuning: TuningCfg = field(default_factory=TuningCfg)
-    label: str = ""
-    """Name of a shipped robot as its makers write it."""
-    paper: PaperCfg = field(default_factory=PaperCfg)
-    """What the paper did with a shipped robot."""
-    settings_file: Path | None = None
-    """File of a user's robot, TOML or Python, set by :func:`sim.robots.find.get_robot`; None of a shipped robot."""
+    label: str = ""  # name of a shipped robot as its makers write it
+    paper: PaperCfg = field(default_factory=PaperCfg)  # what the paper did with a shipped robot
+    settings_file: Path | None = None  # of a user's robot, TOML or Python, set by get_robot; None of a shipped robot
 
     @property
     def spec(self) -> str:
@@ -211,13 +165,10 @@ def needed_senses(terms: Iterable[str]) -> list[str]:
 
 
 def robot_digest(robot: RobotCfg) -> str:
-    """SHA-256 of a robot: its settings without those of training, its model and its meshes.
-
-    A setting that has its default is left out, so that a new one changes no hash. The default of an old one must stay.
-    """
+    """SHA-256 of a robot: its model, its meshes, and its settings but those of training and those at their default."""
     defaults = {f.name: f.default if f.default_factory is MISSING else f.default_factory() for f in fields(robot)}
     counted = {name: value for name, value in vars(robot).items() if name not in _NOT_IN_DIGEST}
-    settings = {name: value for name, value in counted.items() if value != defaults[name]}
+    settings = {name: value for name, value in counted.items() if value != defaults[name]}  # so defaults must stay
     if robot.actuator_net is not None:
         net = robot.actuator_net.file
         settings["actuator_net"] = asdict(robot.actuator_net) | {"file": hashlib.sha256(net.read_bytes()).hexdigest()}
@@ -236,9 +187,8 @@ def check_robot_digest(record: Mapping[str, Any], robot: RobotCfg, file: Path, r
     """Refuses a file's record of the robot before it changed; ``remedy`` is what else helps."""
     expected, now = record.get("robot_sha256"), robot_digest(robot)
     if expected != now:
-        hashes = f"expected SHA-256 {str(expected)[:12]}, got {now[:12]} of {robot.spec}"
-        problem = f"as it was before its settings, model or meshes changed ({hashes})"
-        raise ValueError(f"{file} is of robot '{robot.name}' {problem}: put that back, or {remedy}")
+        was = f"as it was before its settings, model or meshes changed, of SHA-256 {str(expected)[:12]}, not {now[:12]}"
+        raise ValueError(f"{file} is of robot '{robot.name}' {was}: put that back, or {remedy}")
 
 
 def check_robot_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path, remedy: str) -> None:
@@ -248,71 +198,7 @@ def check_robot_identity(record: Mapping[str, Any], robot: RobotCfg, file: Path,
     check_robot_digest(record, robot, file, remedy)
 
 
-_LEGS = ("LF", "RF", "LH", "RH")
-_SIDES = ("left", "right")
-_LEG_JOINTS = ("hip_abduction", "hip_rotation", "hip_flexion", "thigh_joint", "ankle_joint", "toe_joint")
-_PENALTIES = ("yaw_rate", "vel_x", "vel_y", "contact_force", "stumble")
-
 ROBOTS = {
-    "anymal": RobotCfg(
-        name="anymal",
-        label="ANYmal C",
-        model_file=_ROBOTS_DIR / "anymal.xml",
-        base_geoms=("base",),
-        foot_geoms=tuple(f"{leg}_FOOT" for leg in _LEGS),
-        limb_geoms=tuple(f"{leg}_{part}" for leg in _LEGS for part in ("THIGH", "SHANK")),
-        joint_names=tuple(f"{leg}_{joint}" for leg in _LEGS for joint in ("HAA", "HFE", "KFE")),
-        default_joint_pos=(0.0, 0.4, -0.8) * 2 + (0.0, -0.4, 0.8) * 2,
-        default_base_height=0.6,
-        footprint=(0.5, 0.4),
-        scan_x=tuple(k / 10 for k in range(-8, 9)),
-        scan_y=tuple(k / 10 for k in range(-5, 6)),
-        contact_force_limit=500.0,
-        penalties=(*_PENALTIES, "collision"),
-        collision_bit=False,
-        training=TrainingCfg(added_base_mass=(-5.0, 5.0)),
-        tuning=TuningCfg(tracking_lin_vel=6.0),
-    ),
-    "cassie": RobotCfg(
-        name="cassie",
-        label="Cassie",
-        model_file=_ROBOTS_DIR / "cassie.xml",
-        base_geoms=("pelvis",),
-        foot_geoms=tuple(f"{side}_toe" for side in _SIDES),
-        limb_geoms=(),
-        joint_names=tuple(f"{joint}_{side}" for side in _SIDES for joint in _LEG_JOINTS),
-        default_joint_pos=(0.1, 0.0, 1.0, -1.8, 1.57, -1.57, -0.1, 0.0, 1.0, -1.8, 1.57, -1.57),
-        default_base_height=1.0,
-        footprint=(0.4, 0.3),
-        scan_x=tuple(k / 10 for k in range(-5, 6)),
-        scan_y=tuple(k / 10 for k in range(-5, 6)),
-        contact_force_limit=300.0,
-        penalties=_PENALTIES,
-        collision_bit=True,
-        nconmax=7,  # the most there can be: a sphere, and 3 on each toe
-        max_speed=300.0,  # its light ankles get faster than 100 rad/s in falls, by their motors alone
-        training=TrainingCfg(
-            rewards=RewardCfg(
-                tracking_lin_vel=2.0,
-                tracking_ang_vel=2.0,
-                lin_vel_z=-0.5,
-                ang_vel_xy=0.0,
-                torques=-5e-6,
-                dof_acc=-1e-7,
-                feet_air_time=2.5,
-                dof_pos_limits=-1.0,
-                no_fly=0.25,
-                orientation=-1.0,
-                joint_deviation=-0.2,
-                termination=-200.0,
-            ),
-            only_positive=False,
-            soft_joint_limit=0.95,
-            steady_joints=tuple(f"hip_{joint}_{side}" for side in _SIDES for joint in ("abduction", "rotation")),
-            start_joint_range=0.2,
-        ),
-        learning=LearningCfg(num_envs=2048, iterations=3400, init_noise_std=0.5, desired_kl=0.02, entropy=0.005),
-        tuning=TuningCfg(tracking_lin_vel=4.0, large_rounds=False),
-        paper=PaperCfg(num_envs=600, terrains=100, swap_every=200, iterations=3000, test_terrains=180),
-    ),
-}
+    name: from_builtins(RobotCfg, {"name": name, "model_file": str(_ROBOTS_DIR / f"{name}.xml"), **settings}, name)
+    for name, settings in read_toml(_ROBOTS_DIR / "shipped.toml").items()
+}  # the shipped ones

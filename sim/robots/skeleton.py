@@ -12,8 +12,14 @@ from numpy.typing import NDArray
 from sim.robots.compiled import mj, read_mesh, robot_spec, touching_geoms
 from sim.robots.robot import RobotCfg
 
-_SHAPE = mj.mjtGeom
 _SEGMENTS = 20  # round a capsule
+_PRIMITIVES: dict[Any, Callable[[NDArray[np.float64]], trimesh.Trimesh]] = {
+    mj.mjtGeom.mjGEOM_CAPSULE: lambda size: trimesh.creation.capsule(2.0 * size[1], size[0], (_SEGMENTS, _SEGMENTS)),
+    mj.mjtGeom.mjGEOM_CYLINDER: lambda size: trimesh.creation.cylinder(size[0], 2.0 * size[1], _SEGMENTS),
+    mj.mjtGeom.mjGEOM_BOX: lambda size: trimesh.creation.box(2.0 * size),
+    mj.mjtGeom.mjGEOM_ELLIPSOID: lambda size: trimesh.creation.icosphere(2).apply_scale(size),
+    mj.mjtGeom.mjGEOM_SPHERE: lambda size: trimesh.creation.icosphere(2).apply_scale(size[0]),
+}  # of sizes [m], about their own centre, along z
 _CREASE = 0.6  # angle between faces from which on an edge is sharp [rad]
 
 _LOOK_SUFFIX = ".look.xml"  # of an MJCF beside the model file, with shapes to show in place of the model's
@@ -25,12 +31,7 @@ _NO_COLOR = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's, of a geom that names none
 
 
 def shown_spec(robot: RobotCfg) -> Any:
-    """An ``MjSpec`` to look at, with the robot's joints in the robot's order behind that of its base.
-
-    Shapes have the names that the simulation gives them: in a URDF that of the link, in an MJCF ``<body>_geom_<k>`` if
-    they have none. A body shows its shapes of a file with the suffix ``.look.xml`` beside the model, else those of the
-    model that touch nothing, else all of them.
-    """
+    """An ``MjSpec`` to look at: bodies show shapes of ``<model>.look.xml``, else those that touch nothing, else all."""
     try:
         spec = robot_spec(robot, visuals=True)
     except ValueError:  # for example a visual mesh of too many faces
@@ -57,8 +58,8 @@ def shown_spec(robot: RobotCfg) -> Any:
                 is_base = geom.name in robot.base_geoms
                 geom.rgba = _FOOT_COLOR if is_foot else _BASE_COLOR if is_base else _LIMB_COLOR
     if looks:
-        names = ", ".join(body.name for body in spec.bodies[1:])
-        raise ValueError(f"{look_file} has a body '{next(iter(looks))}': expected those of {robot.model_file}, {names}")
+        names = [body.name for body in spec.bodies[1:]]
+        raise ValueError(f"{look_file} must have the bodies of {robot.model_file}, {names}, got {[*looks]}")
     return spec
 
 
@@ -73,10 +74,7 @@ def robot_model(spec: Any, robot: RobotCfg) -> Any:
 
 
 def find_touches(model: Any, robot: RobotCfg) -> dict[int, tuple[int, ...]]:
-    """Visible geoms by index, with the columns of ``robot.geom_names`` whose touch each shows.
-
-    A shape whose middle is in a foot shows that foot's touch, any other the touch of its body's base and limbs.
-    """
+    """Visible geoms by index, with the columns of ``robot.geom_names`` whose touch each shows."""
     ids = [model.geom(name).id for name in robot.geom_names]
     num_bodily = len(robot.geom_names) - len(robot.foot_geoms)
     touches = {}
@@ -103,19 +101,18 @@ class Skeleton:
     """A robot's bodies without the world."""
 
     def __init__(self, robot: RobotCfg) -> None:
-        self.model: Any = robot_model(shown_spec(robot), robot)
-        """The ``MjModel``, whose body 0 is the world."""
+        self.model: Any = robot_model(shown_spec(robot), robot)  # the ``MjModel``, whose body 0 is the world
         self.num_bodies: int = self.model.nbody - 1
         self.touches = find_touches(self.model, robot)
 
     def shape(self, geom: int) -> tuple[trimesh.Trimesh, NDArray[np.float64]]:
         """A geom in its body's frame [m], and its colour, RGB 0 to 1."""
         model = self.model
-        kind = int(model.geom_type[geom])
-        if kind == _SHAPE.mjGEOM_MESH:
+        kind = mj.mjtGeom(model.geom_type[geom])
+        if kind == mj.mjtGeom.mjGEOM_MESH:
             shape = trimesh.Trimesh(*read_mesh(model, geom), process=False)
         else:
-            shape = trimesh.graph.smooth_shade(_make_primitive(kind, model.geom_size[geom]), angle=_CREASE)
+            shape = trimesh.graph.smooth_shade(_PRIMITIVES[kind](model.geom_size[geom]), angle=_CREASE)
         transform = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])  # w x y z too
         transform[:3, 3] = model.geom_pos[geom]
         color = model.geom_rgba[geom]
@@ -124,29 +121,11 @@ class Skeleton:
         return shape.apply_transform(transform), color[:3].astype(np.float64)
 
     def body_poses(self, qpos: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Origins of the bodies in the world [m] and body-to-world quaternions w x y z.
-
-        Shapes (num_frames, num_bodies, 3) and (num_frames, num_bodies, 4), of MuJoCo's joint coordinates, shape
-        (num_frames, nq), as :meth:`sim.recording.recorder.Recording.qpos` gives them.
-        """
+        """Origins [m] and quaternions w x y z of the bodies, (num_frames, num_bodies, 3 or 4), of MuJoCo's ``qpos``."""
         data = mj.MjData(self.model)
-        positions = np.empty((len(qpos), self.num_bodies, 3))
-        quaternions = np.empty((len(qpos), self.num_bodies, 4))
+        poses = np.empty((len(qpos), self.num_bodies, 7))
         for frame, row in enumerate(qpos):
             data.qpos[:] = row
             mj.mj_kinematics(self.model, data)
-            positions[frame] = data.xpos[1:]
-            quaternions[frame] = data.xquat[1:]
-        return positions, quaternions
-
-
-def _make_primitive(kind: int, size: NDArray[np.float64]) -> trimesh.Trimesh:
-    """A shape about its own centre, along z."""
-    round_shape = {"radius": float(size[0]), "height": 2.0 * float(size[1])}
-    if kind == _SHAPE.mjGEOM_CAPSULE:
-        return trimesh.creation.capsule(**round_shape, count=(_SEGMENTS, _SEGMENTS))
-    if kind == _SHAPE.mjGEOM_CYLINDER:
-        return trimesh.creation.cylinder(**round_shape, sections=_SEGMENTS)
-    if kind == _SHAPE.mjGEOM_BOX:
-        return trimesh.creation.box(extents=2.0 * size)
-    return trimesh.creation.icosphere(subdivisions=2).apply_scale(size if kind == _SHAPE.mjGEOM_ELLIPSOID else size[0])
+            poses[frame] = np.hstack([data.xpos[1:], data.xquat[1:]])
+        return poses[..., :3], poses[..., 3:]

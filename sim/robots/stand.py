@@ -46,26 +46,18 @@ class Standing:
     """How a robot stood in its default pose, and how the dropped ones lay."""
 
     robot: RobotCfg
-    height: tuple[float, float]
-    """Height of the base at the start and at the end [m]."""
-    right_height: float
-    """Lowest height of the base at which no foot starts in the ground [m]."""
-    bottoms: dict[str, float]
-    """Lowest point of each geom at the start, over the ground [m]."""
-    tilt_deg: float
-    """Tilt of the base at the end."""
-    joint_error: float
-    """Largest distance of a joint from its default angle at the end [rad]."""
-    carried: dict[str, float]
-    """Share of the weight that each touching geom carries, on average over the last half second."""
-    restless: float
-    """How much the forces on its feet change from one physics step to the next in that time, in weights."""
-    contacts: int
-    """Largest number of contacts of a robot."""
-    overflowed: bool
-    """Whether there was too little room for contacts, at any time."""
-    finite: bool
-    """Whether all states are numbers at the end."""
+    height: tuple[float, float]  # height of the base at the start and at the end [m]
+    right_height: float  # lowest height of the base at which no foot starts in the ground [m]
+    bottoms: dict[str, float]  # lowest point of each geom at the start, over the ground [m]
+    tilt_deg: float  # tilt of the base at the end
+    joint_error: float  # largest distance of a joint from its default angle at the end [rad]
+    lowest_geom: str  # at the start
+    foot_gap: float  # height of the lowest foot over the ground at the start [m]; negative in the ground
+    carried: dict[str, float]  # share of the weight on each touching geom, on average over the last half second
+    restless: float  # how much the forces on its feet change from one physics step to the next in that time, in weights
+    contacts: int  # largest number of contacts of a robot
+    overflowed: bool  # whether there was too little room for contacts, at any time
+    finite: bool  # whether all states are numbers at the end
 
     @property
     def stands(self) -> bool:
@@ -77,16 +69,6 @@ class Standing:
     def stray(self) -> float:
         """Share of the weight that is on geoms without a role, or on nothing."""
         return 1.0 - sum(self.carried.values())
-
-    @property
-    def lowest_geom(self) -> str:
-        """Name of the geom that is lowest at the start."""
-        return min(self.bottoms, key=self.bottoms.__getitem__)
-
-    @property
-    def foot_gap(self) -> float:
-        """Height of the lowest foot over the ground at the start [m]; negative in the ground."""
-        return min(self.bottoms[name] for name in self.robot.foot_geoms)
 
     @property
     def mistakes(self) -> list[str]:
@@ -139,11 +121,14 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     weight = float(sim.model.body_mass.numpy()[: len(sim.poses.column_of_body)].sum()) * _GRAVITY
     on_feet = forces[:, [name in robot.foot_geoms for name in robot.geom_names]] / weight
     shares = zip(robot.geom_names, forces.mean(axis=0) / weight, strict=True)
+    bottoms = {name: robot.default_base_height + bottom for name, bottom in bottoms.items()}
     return Standing(
         robot=robot,
         height=(robot.default_base_height, float(end[2])),
         right_height=start_height(robot, builder),
-        bottoms={name: robot.default_base_height + bottom for name, bottom in bottoms.items()},
+        bottoms=bottoms,
+        lowest_geom=min(bottoms, key=bottoms.__getitem__),
+        foot_gap=min(bottoms[name] for name in robot.foot_geoms),
         tilt_deg=float(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),
         joint_error=float(np.abs(end[7:] - robot.default_joint_pos).max(initial=0.0)),
         carried={name: float(share) for name, share in shares if share > 1e-3},
@@ -210,7 +195,6 @@ def _joint_rows(robot: RobotCfg, sim: Simulation) -> Iterator[Sequence[str]]:
 
 
 def _geom_rows(robot: RobotCfg, sim: Simulation, builder: newton.ModelBuilder) -> Iterator[Sequence[str]]:
-    """Heads and a row a geom."""
     model: Any = sim.solver.mj_model
     yield "geom", "role", "body", "shape", "size [m]", "friction", "time constant [s]"
     roles = {name: role for role in ("base", "foot", "limb") for name in getattr(robot, f"{role}_geoms")}

@@ -24,9 +24,7 @@ from sim.robots.robot import ROBOTS, RobotCfg, needed_senses
 
 _ROLES = ("base_geoms", "foot_geoms", "limb_geoms")
 _NAMES = (*_ROLES, "joint_names", "arm_joints", "penalties", "senses")
-_NOT_IN_TOML = ("label", "paper", "settings_file")
-NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"
-"""What a robot may be called, since files and folders are called after it."""
+NEW_NAME = f"a new name of letters, digits, . _ and -, not {' or '.join(ROBOTS)}"  # of files and folders, too
 _FOOT_RISE = 0.015  # a foot's lowest point is at most so much above the robot's lowest one [m]
 _MAX_SPEED = 300.0  # light legs get faster than 100 rad/s in falls, and where they shake [rad/s]
 
@@ -71,7 +69,7 @@ def load_robot(path: Path) -> RobotCfg:
 def _read_toml(path: Path, file: Path) -> RobotCfg:
     """The robot of a robot.toml; what it leaves out is inferred from its model."""
     settings = read_toml(path)
-    names = [field.name for field in fields(RobotCfg) if field.name not in _NOT_IN_TOML]
+    names = [field.name for field in fields(RobotCfg) if field.name not in ("label", "paper", "settings_file")]
     if unknown := [name for name in settings if name not in names]:
         raise ValueError(f"{path} has settings that do not exist: {', '.join(unknown)}; there are {', '.join(names)}")
     if no_list := [name for name in _NAMES if not isinstance(settings.get(name, []), list)]:
@@ -85,10 +83,9 @@ def _read_toml(path: Path, file: Path) -> RobotCfg:
 
 
 def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = False) -> list[Any]:
-    """One value a joint, of a list, of one number, or of a table by joint names or regular expressions.
+    """One value a joint, of a list, of one number, or of a table by joint names or else regular expressions.
 
-    A name counts before an expression; every joint must be matched once, and every entry must match. ``partly``: joints
-    without a match have None; entries may match no joint, but not all of them.
+    Every joint must match one entry, every entry a joint; ``partly``: a joint may have None, and some entries no joint.
     """
     if isinstance(value, list):
         return value
@@ -108,15 +105,7 @@ def per_joint(value: Any, joints: Sequence[str], what: str, *, partly: bool = Fa
 
 
 def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> dict[str, Any]:
-    """Settings of a robot.toml with those that it leaves out, as far as its compiled model says them.
-
-    The base are the geoms of the first body; feet are the geoms of last bodies that come within 1.5 cm of the lowest
-    point in the default pose; limbs are all others. The default pose is the keyframe ``home`` of the file, else zero or
-    the nearest angle that a joint can take. The contact force limit is the weight. The name is that of the folder of
-    ``file``, the robot.toml; the scan is the first one in the observation of a controller.toml beside it, its terms
-    decide the senses, and joints that it does not move are arm joints. ``given`` has one value a joint where a setting
-    is of joints.
-    """
+    """Settings of a robot.toml with those that it leaves out, as docs/robots.md says; ``given`` has lists a joint."""
     from sim.robots.model import make_builder
     from sim.robots.probes import measure_extents
 
@@ -140,10 +129,9 @@ def infer_settings(given: dict[str, Any], file: Path, robot_file: RobotFile) -> 
     feet = [k for k in range(model.ngeom) if model.geom(k).name in roles["foot_geoms"]]
     reach = np.abs(data.geom_xpos[feet, :2]) + model.geom_rbound[feet, None]  # of the feet from the base
     weight = -float(model.opt.gravity[2]) * float(model.body_mass.sum())
-    controller = file.with_name("controller.toml")
+    controller, names = file.with_name("controller.toml"), joint_names(model)
     content = read_toml(controller) if controller.exists() else {}
     terms = [term for term in content.get("observation", ()) if isinstance(term, dict)]
-    names = joint_names(model)
     scan = next((term for term in terms if term.get("term") == "scan"), {})
     inferred = {
         "name": file.parent.name,
@@ -177,8 +165,8 @@ def describe_inferred(robot: RobotCfg) -> str:
 def write_setting(file: Path, name: str, value: Any, reason: str = "") -> None:
     """Writes a setting to the top of a robot.toml, with the reason as a comment, in place of a line of its name."""
     text = re.sub(rf"^{name}\s*=.*\n?", "", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    line = f"{name} = {to_toml(value)}" + (f"  # {reason}" if reason else "")
-    write_atomically(file, f"{line}\n{text}".encode())
+    comment = f"  # {reason}" if reason else ""
+    write_atomically(file, f"{name} = {to_toml(value)}{comment}\n{text}".encode())
 
 
 def settings_problems(robot: RobotCfg) -> Iterator[str]:

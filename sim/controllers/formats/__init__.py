@@ -1,1 +1,1 @@
-"""Files of controllers, one format a module: networks that are loaded, and sources that are imported with a robot."""
+"""Files of controllers: networks that are loaded, and sources that are imported with a robot, by who writes them."""

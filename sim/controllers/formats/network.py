@@ -16,10 +16,7 @@ from sim.controllers.runner import Recurrent, is_graph_safe, with_rows_of_zeros
 from sim.controllers.spec import in_one_line
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
-"""Actions, shape (num_envs, num_joints), of observation rows, shape (num_envs, observation_size).
-
-A policy that remembers has a method ``reset``, of a kind of :class:`sim.controllers.runner.Memory`.
-"""
+"""Actions (num_envs, num_joints) of observation rows (num_envs, observation_size); with ``reset`` if it remembers."""
 
 
 def load_network(
@@ -27,9 +24,8 @@ def load_network(
 ) -> Policy:
     """The network of a checkpoint, TorchScript or ONNX file, with a ``reset(rows)`` if it remembers.
 
-    ``sizes`` are the columns and actions that it must have, which errors call those of ``label``; None takes those of
-    the file, and a TorchScript module as it is. ``activation`` stands between the layers of a checkpoint; None takes
-    that of its file or training.
+    ``sizes`` are the columns and actions that it must have, those of ``label``; None takes the file's and a
+    TorchScript module as it is. ``activation`` is that of a checkpoint; None takes its file's or training's.
     """
     if path.suffix.lower() == ".onnx":
         from sim.controllers.formats.onnx import load_onnx  # onnxruntime takes long to load, and few files need it
@@ -45,17 +41,14 @@ def load_network(
         except ValueError:
             raise
         except Exception as foreign:
-            what = "is neither an rsl_rl checkpoint of plain tensors nor a TorchScript module"
-            why = f"(truncated, foreign, or holding code): {in_one_line(error)}"
-            remedy = "give one of these, or an ONNX file that ends in .onnx"
-            raise ValueError(f"policy '{path}' {what} {why}: {remedy}") from foreign
+            must = "must be an rsl_rl checkpoint of plain tensors, TorchScript, or ONNX that ends in .onnx"
+            raise ValueError(f"policy '{path}' {must}: {in_one_line(error)}") from foreign
         return module if sizes is None else _separate_robots(module, probe, path, sizes[0], device)
     policy = make_actor(content, path, activation)
     if sizes is not None and policy.sizes != sizes:
-        what = f"maps {policy.sizes[0]} observations to {policy.sizes[1]} actions"
-        must = f"{label} has {sizes[0]} observations and {sizes[1]} joints"
-        remedy = "give one that fits, or describe it (docs/controllers.md)"
-        raise ValueError(f"policy '{path}' {what}, but {must}: {remedy}")
+        (seen, moved), (width, count) = policy.sizes, sizes
+        must = f"{label} has {width} observations and {count} joints: describe it (docs/controllers.md)"
+        raise ValueError(f"policy '{path}' maps {seen} observations to {moved} actions, but {must}")
     return policy.to(device).eval()
 
 
@@ -158,8 +151,7 @@ def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: st
         return _Script(module)
     first, second = map(_take_actions, outputs)
     if first is not outputs[0]:
-        what = f"returns {len(outputs[0])} values: the first are taken for actions, the others are ignored"
-        warnings.warn(f"policy '{path}' {what}", stacklevel=2)
+        warnings.warn(f"policy '{path}' returns {len(outputs[0])} values: all but the first are ignored", stacklevel=2)
     after = _read_tensors(probe)
     initial = {name: value for name, value in before.items() if not torch.equal(value, after[name])}
     if not isinstance(first, torch.Tensor) or not initial:
@@ -177,5 +169,4 @@ def _separate_robots(module: Any, probe: Any, path: Path, width: int, device: st
                 together = torch.stack([recurrent(step) for step in rows], dim=1)
                 if torch.allclose(together, torch.stack(separate), rtol=1e-4, atol=1e-4):
                     return _RecurrentScript(module, initial, axis).to(device)
-    remedy = "give the checkpoint that it was made of"
-    raise ValueError(f"policy '{path}' remembers one robot alone, in {', '.join(initial)}: {remedy}")
+    raise ValueError(f"policy '{path}' remembers one robot alone, in {', '.join(initial)}: give its checkpoint")

@@ -43,7 +43,7 @@ class _Ports:
         """Shape of one robot's input, and of its states, by their names; None where it is free."""
         self.states = {port.name: self._read_shape(port, (1, 0)) for port in inputs if port.name in pairs}
         if not rest or not self.columns or None in sum(self.states.values(), ()):
-            got = f"{', '.join(port.name for port in inputs)} and {', '.join(names)}"
+            got = [port.name for port in inputs], names
             raise ValueError(f"it must have an input and an output, and states X_in and X_out, got {got}")
         width = None if None in sum(self.columns.values(), ()) else sum(map(math.prod, self.columns.values()))
         count = self._read_shape(actions[0])[-1]
@@ -54,8 +54,7 @@ class _Ports:
             raise ValueError(f"expected {self.sizes[0]} observations and {self.sizes[1]} actions, got {(width, count)}")
         if width is None:
             self.columns = dict.fromkeys(self.columns, (self.sizes[0],))
-        self.outputs = {actions[0].name: 0} | {pairs[name]: self.axes[name] for name in self.states}
-        """Axis of robots of each output that is needed."""
+        self.outputs = {actions[0].name: 0} | {pairs[name]: self.axes[name] for name in self.states}  # and their axes
         self.ignored = [name for name in names if name not in self.outputs]
 
     def _read_shape(self, port: Any, axes: Sequence[int] = (0,)) -> tuple[Any, ...]:
@@ -64,8 +63,8 @@ class _Ports:
         axes = sorted(axes, key=lambda axis: shape[axis : axis + 1] != [None])
         axis = next((axis for axis in axes if shape[axis : axis + 1] in ([None], [1])), None)
         if port.type != "tensor(float)" or len(shape) < 2 or axis is None:
-            must = "float32 of shape (batch, size) with a batch that is free or 1"
-            raise ValueError(f"'{port.name}' must be {must}, got {port.type} of shape {port.shape}")
+            got = f"{port.type} of shape {port.shape}"
+            raise ValueError(f"'{port.name}' must be float32 of shape (batch, size), its batch free or 1, got {got}")
         self.is_single |= shape[axis] == 1
         self.axes[port.name] = axis
         return (*shape[:axis], *shape[axis + 1 :])
@@ -205,12 +204,8 @@ _LAYERS: dict[str, Callable[..., Any]] = {
 def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLayers | OnnxPolicy | _OnnxRecurrent":
     """A controller from an ONNX file of these observation and action sizes, or of any if None, on a torch device.
 
-    Its inputs are columns of the observation (batch, observation_size) in their order, and the states that it returned;
-    its outputs actions (batch, num_joints), and states called X_out for the inputs X or X_in. Others are ignored. Only
-    these files are read; no code runs.
-
-    A graph of plain layers becomes a torch module, if it maps random rows as onnxruntime does. Another graph for one
-    robot is changed into one for any number, if that acts on each robot as before; else it runs once a robot.
+    Inputs are columns of the observation, and states X or X_in; outputs are actions, and states X_out. Plain layers
+    become a torch module, another graph for one robot one for any number, if that acts as before on random rows.
     """
     target = torch.device(device)
     try:
@@ -230,9 +225,8 @@ def load_onnx(path: Path, sizes: tuple[int, int] | None, device: str) -> "OnnxLa
         warnings.warn(f"policy '{path}' returns more than actions: {', '.join(ports.ignored)}: ignored", stacklevel=2)
     if isinstance(network, OnnxPolicy):
         if target.type == "cuda" and policy.session.get_providers()[0] != _CUDA:
-            what = "runs on the CPU, since this onnxruntime has no CUDA that works"
-            remedy = "install onnxruntime-gpu, or give the rsl_rl checkpoint"
-            warnings.warn(f"policy '{path}' has more than plain layers and {what}: {remedy}", stacklevel=2)
+            what = "has more than plain layers and runs on the CPU: install onnxruntime-gpu, or give the checkpoint"
+            warnings.warn(f"policy '{path}' {what}", stacklevel=2)
         if network.ports.is_single:
             warnings.warn(f"policy '{path}' can only run one robot after the other: searches take long", stacklevel=2)
     network = _OnnxRecurrent(network, ports) if ports.states else network
@@ -248,15 +242,13 @@ def _make_if_equal(make: Callable[[], Any], policy: OnnxPolicy) -> Any:
         for count, size in ((1, 0.1), (5, 1.0), (40, 3.0)):
             rows, *states = (size * torch.randn([count, *shape], generator=generator) for shape in shapes)
             for value, expected in zip(made.run(rows, states), policy.run(rows, states), strict=True):
-                largest = max(1.0, float(expected.abs().max()))
-                torch.testing.assert_close(value, expected, rtol=0.0, atol=1e-4 * largest)
+                torch.testing.assert_close(value, expected, rtol=0.0, atol=1e-4 * max(1.0, float(expected.abs().max())))
     except Exception:  # onnxruntime's errors have no base
         return None
     return made
 
 
 def _free_batch(model: Any, ports: _Ports) -> bytes:
-    """The graph for any number of robots."""
     axes = ports.axes | ports.outputs
     for port in (*model.graph.input, *model.graph.output):
         if port.name in axes:
@@ -266,11 +258,7 @@ def _free_batch(model: Any, ports: _Ports) -> bytes:
 
 
 def export_onnx(policy: MlpPolicy, path: Path) -> None:
-    """Writes a policy as one self-contained file that ends in .onnx; its folder is made if need be.
-
-    Its input is ``observation``, shape (batch, observation_size), its output ``action``, shape (batch, num_joints),
-    both float32, the batch free. The same policy gives the same bytes.
-    """
+    """Writes a policy, from ``observation`` to ``action``, with a free batch, as one .onnx of always the same bytes."""
     if path.suffix.lower() != ".onnx":
         raise ValueError(f"'{path}' must end in .onnx, by which controllers of that kind are known")
     if policy.activation not in _OPERATORS:

@@ -99,8 +99,7 @@ def make_actor(content: Any, path: Path, activation: str | None) -> MlpPolicy | 
         if activation is None and (agent := agent_file(path)) is not None:
             activation = read_activation(read_yaml(agent))
         if activation is None:
-            described = 'describe it with activation = "elu", or another, in a controller.toml (docs/controllers.md)'
-            remedy = f"put the agent.yaml of its training beside it, or {described}"
+            remedy = 'put the agent.yaml of its training beside it, or write activation = "elu" into a controller.toml'
             raise ValueError(f"policy '{path}' does not say what is between its layers: {remedy}")
         if not isinstance(activation, str) or activation not in ACTIVATIONS:
             raise ValueError(f"policy '{path}': activation must be one of {', '.join(ACTIVATIONS)}, got {activation}")
@@ -111,7 +110,6 @@ def make_actor(content: Any, path: Path, activation: str | None) -> MlpPolicy | 
 
 
 def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
-    """The actor's tensors by rsl_rl 5's names."""
     tables = [content.get(f"{kind}_state_dict") for kind in ("actor", "model")] if isinstance(content, dict) else []
     state: dict[Any, torch.Tensor] = next((table for table in tables if isinstance(table, dict)), {})
     names = {key: _FORMER_PREFIX.sub(lambda match: _FORMER_NAMES[match[0]], str(key)) for key in state}
@@ -123,13 +121,11 @@ def _read_state(content: Any, path: Path) -> dict[str, torch.Tensor]:
         raise ValueError(f"policy '{path}': obs_norm_state_dict must be a table, got {type(separate).__name__}")
     normaliser = {f"obs_normalizer.{key}": value for key, value in separate.items()}
     names |= {key: key for key in normaliser}
-    if unknown := [str(key) for key, name in names.items() if not re.fullmatch(_KNOWN_NAMES, name)]:
-        what = f"has more than a perceptron or a recurrent network: {', '.join(unknown)}"
-        raise ValueError(f"policy '{path}' {what}: export it as TorchScript or ONNX")
+    if unknown := ", ".join(str(key) for key, name in names.items() if not re.fullmatch(_KNOWN_NAMES, name)):
+        raise ValueError(f"policy '{path}' is more than an MLP or RNN, by {unknown}: export TorchScript or ONNX")
     statistics = {name.partition(".")[2] for name in names.values() if name.startswith("obs_normalizer.")}
     if statistics and not {"_mean", "_std"} <= statistics:
-        got = ", ".join(sorted(statistics))
-        raise ValueError(f"policy '{path}' must have _mean and _std of its normaliser, got {got}")
+        raise ValueError(f"policy '{path}' must have _mean and _std of its normaliser, got {sorted(statistics)}")
     return {names[key]: value for key, value in state.items()} | normaliser
 
 

@@ -26,22 +26,16 @@ TERM_NAMES = {name: term for term, names in _NAMES_BY_TERM.items() for name in n
 """Terms of the observation by the names that rl_sar and mjlab give them."""
 BLIND_TERMS = ("ang_vel", "gravity", "command", "joint_pos", "joint_vel", "last_action")
 """Terms of a controller without sight, in the usual order."""
-SETTINGS = ("default_joint_pos", "stiffness", "damping", "action_scale", "physics_dt", "decimation")
-"""Settings that most sources have, under names of their own."""
 
 
 @dataclass(kw_only=True)
 class Source:
     """Settings that are read from a source, for a robot whose model the user or the source names."""
 
-    file: Path
-    """The file that errors name."""
-    model_file: Path | None
-    """The robot's MJCF or URDF; None until it is known."""
-    settings: dict[str, Any] = field(default_factory=dict)
-    """Fields of robot.toml and controller.toml; None where the user has to fill one in."""
-    reasons: dict[str, str] = field(default_factory=dict)
-    """Why a setting is a guess, or what the user should fill in."""
+    file: Path  # the file that errors name
+    model_file: Path | None  # the robot's MJCF or URDF; None until it is known
+    settings: dict[str, Any] = field(default_factory=dict)  # of robot.toml and controller.toml; None to be filled in
+    reasons: dict[str, str] = field(default_factory=dict)  # why a setting is a guess, or what the user should fill in
 
     @cached_property
     def robot_file(self) -> RobotFile:
@@ -68,10 +62,9 @@ class Source:
 
     def find_weights(self, name: str) -> Path:
         """The file of weights that the source names; its name may have a path of another machine."""
-        folder = self.file.parent
-        file = find_above(name, folder) or folder / Path(name).name
+        file = find_above(name, self.file.parent) or self.file.parent / Path(name).name
         if not file.is_file():
-            raise ValueError(f"{file} is not there: put the weights that {folder} names beside it")
+            raise ValueError(f"{file} is not there: put the weights that {self.file} names beside it")
         return file
 
     def set(self, reason: str = "", **settings: Any) -> None:
@@ -85,9 +78,8 @@ class Source:
 
     def refuse_unknown(self, names: Iterable[str], known: Iterable[str]) -> None:
         """Raises a ValueError with the names that are not known."""
-        if unknown := [str(name) for name in names if name not in known]:
-            what = f"{self.file} says what is not understood: {', '.join(unknown)}"
-            raise ValueError(f"{what}: take it out if it does not matter")
+        if unknown := ", ".join(str(name) for name in names if name not in known):
+            raise ValueError(f"{self.file} says what is not understood: {unknown}: take it out if it does not matter")
 
     def move(self, content: dict[str, Any], names: Mapping[str, str], joints: Sequence[str]) -> None:
         """Moves values from ``content`` to settings of other names; lists in the order of ``joints`` are reordered."""
@@ -169,13 +161,6 @@ def make_terms(names: Iterable[str], scales: Mapping[str, Any], **fields: Mappin
     """Terms of the observation with their scales and fields; a clock has the period of rl_sar and unitree_rl_gym."""
     fields = {"clock": {"period_s": 0.8}} | fields
     return [make_term(name, scales.get(name), **fields.get(name, {})) for name in names]
-
-
-def read_scales(scales: Mapping[str, Any]) -> dict[str, Any]:
-    """Scales of terms by legged_gym's names, in which a command has those of velocities."""
-    names = {"lin_vel": "lin_vel", "ang_vel": "ang_vel", "joint_pos": "dof_pos", "joint_vel": "dof_vel"}
-    command = [scales["lin_vel"], scales["lin_vel"], scales["ang_vel"]]
-    return {"command": command} | {term: scales[name] for term, name in names.items()}
 
 
 def find_checkpoint(folder: Path, *exported: str) -> Path:

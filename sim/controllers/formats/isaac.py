@@ -1,4 +1,4 @@
-"""A run of Isaac Lab: its env.yaml and agent.yaml."""
+"""Trainings in Isaac Lab, and in Isaac Gym by legged_gym, one of its forks, or Booster Gym."""
 
 import re
 from collections.abc import Sequence
@@ -8,25 +8,22 @@ from typing import Any
 import numpy as np
 
 from sim.controllers.formats.rsl_rl import read_activation
-from sim.controllers.formats.source import Source, collapse, find_checkpoint, make_term
+from sim.controllers.formats.source import BLIND_TERMS, Source, collapse, find_checkpoint, make_term, make_terms
 from sim.files.settings import read_yaml, to_toml
 from sim.robots.compiled import PER_JOINT
 from sim.robots.user import per_joint
 
-ISAAC_LAB_TERMS = {
-    "base_lin_vel": "lin_vel",
-    "base_ang_vel": "ang_vel",
-    "projected_gravity": "gravity",
-    "generated_commands": "command",
-    "joint_pos_rel": "joint_pos",
-    "joint_vel_rel": "joint_vel",
-    "last_action": "last_action",
-    "height_scan": "scan",
-    "gait_phase": "clock",
-}
+ISAAC_LAB_TERMS = {"base_lin_vel": "lin_vel", "base_ang_vel": "ang_vel", "projected_gravity": "gravity"}
+ISAAC_LAB_TERMS |= {"generated_commands": "command", "joint_pos_rel": "joint_pos", "joint_vel_rel": "joint_vel"}
+ISAAC_LAB_TERMS |= {"last_action": "last_action", "height_scan": "scan", "gait_phase": "clock"}
 """Terms of the observation by the names of Isaac Lab's functions."""
 _NET_SETTINGS = ("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
 _IDEAL_DRIVE = {"saturation_effort": 1e6, "velocity_limit": 1e6}  # stands beside joints with a DC motor
+_GAINS = ("stiffness", "damping")
+_CONTROL = ("control_type", "use_actuator_network", "actuator_net_file", *_GAINS, "action_scale", "decimation")
+_HIM_TERMS = ("command", "ang_vel", "gravity", "joint_pos", "joint_vel", "last_action")
+_DEPLOYED = {"default_joint_pos": "default_qpos", "effort_limit": "torque_limit"} | {name: name for name in _GAINS}
+_BOOSTER_TERMS = ("gravity", "ang_vel", "command", "clock", "joint_pos", "joint_vel", "last_action")
 
 
 def read_isaac_lab(path: Path, source: Source) -> Path:
@@ -37,8 +34,7 @@ def read_isaac_lab(path: Path, source: Source) -> Path:
     agent = read_yaml(agent_file) if agent_file.is_file() else {}
     articulation = env["scene"]["robot"]
     source.find_model_file((articulation.get("spawn") or {}).get("asset_path"))
-    pose = articulation["init_state"]["joint_pos"]
-    pose = per_joint(pose, source.joints, f"{source.file}: init_state.joint_pos", partly=True)
+    pose = per_joint(articulation["init_state"]["joint_pos"], source.joints, f"{source.file}: joint_pos", partly=True)
     source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
     _read_actuators(articulation["actuators"], source)
     source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])
@@ -46,10 +42,9 @@ def read_isaac_lab(path: Path, source: Source) -> Path:
         source.set_speed((command.get("ranges") or {}) if isinstance(command, dict) else {})
     joint_order, reason = _order_joints(env, path, source)
     read_action(env["actions"], joint_order, reason, source, limit=agent.get("clip_actions"))
-    observation_groups = agent.get("obs_groups") or {}
+    groups = agent.get("obs_groups") or {}
     rows, lengths = [], []
-    for group_name in observation_groups.get("actor") or observation_groups.get("policy") or ["policy"]:
-        group = env["observations"][group_name]
+    for group in map(env["observations"].__getitem__, groups.get("actor") or groups.get("policy") or ["policy"]):
         terms = {name: term for name, term in group.items() if isinstance(term, dict)}
         common = group.get("history_length")
         lengths += [(term.get("history_length") if common is None else common) or 1 for term in terms.values()]
@@ -64,7 +59,6 @@ def read_isaac_lab(path: Path, source: Source) -> Path:
 
 
 def _read_actuators(groups: dict[str, Any], source: Source) -> None:
-    """Gains, limits and delays."""
     notes: list[str] = []
     ideal = [name for name, group in groups.items() if group.get("saturation_effort") is None]
     omitted = [*_IDEAL_DRIVE] if len(ideal) == len(groups) else []
@@ -118,8 +112,8 @@ def _order_joints(env: dict[str, Any], path: Path, source: Source) -> tuple[list
     """All joints in the order of the simulation, with the reason if env.yaml does not say it."""
     if descriptors := sorted(path.rglob("*IO_descriptors.yaml")):
         return read_yaml(descriptors[0])["articulations"]["robot"]["joint_names"], ""
-    is_newton = "newton" in str(env["sim"].get("physics")).lower()
-    ordering = env["scene"]["robot"].get("joint_ordering") or ("mjwarp" if is_newton else "physx")
+    usual = "mjwarp" if "newton" in str(env["sim"].get("physics")).lower() else "physx"
+    ordering = env["scene"]["robot"].get("joint_ordering") or usual
     if isinstance(ordering, list):
         return ordering, ""
     if ordering not in ("physx", "mjwarp"):
@@ -193,3 +187,78 @@ def read_scan(sensor: dict[str, Any], grid: dict[str, Any], centre: Sequence[flo
     for axis, side, mid in zip("xy", grid["size"], centre, strict=False):
         fields[axis] = [round(mid - side / 2 + k * step, 4) for k in range(int(side / step + 1e-6) + 1)]
     return fields
+
+
+def read_legged_gym(path: Path, source: Source) -> Path:
+    """Settings of a configuration, whose observation's width says the terms; returns the network or checkpoint."""
+    cfg = read_yaml(path)
+    control, normalization, terrain = cfg["control"], cfg["normalization"], cfg.get("terrain") or {}
+    source.find_model_file(cfg["asset"]["file"])
+    source.refuse_unknown(control, _CONTROL)
+    if control.get("control_type", "P") != "P":
+        raise ValueError(f"control_type must be P, joint positions, got {control['control_type']}")
+    if control.get("use_actuator_network"):
+        source.set(actuator_net={"file": str(source.find_weights(control["actuator_net_file"]).resolve())})
+    else:
+        stiffness, damping = (source.match_parts(control[name], name) for name in _GAINS)
+        source.set(stiffness=stiffness, damping=damping)
+    source.set(default_joint_pos=[cfg["init_state"]["default_joint_angles"][joint] for joint in source.joints])
+    source.set(physics_dt=cfg["sim"]["dt"], decimation=control["decimation"], action_scale=control["action_scale"])
+    source.set(action_clip=normalization["clip_actions"], observation_clip=normalization["clip_observations"])
+    source.set_speed((cfg.get("commands") or {}).get("ranges") or {})
+    joints = [names[-1] for names in sorted(source.joint_paths())]
+    source.set_joints(joints, "a leg after the other, legs by name, as Isaac Gym orders joints")
+    width, row = cfg["env"]["num_observations"], cfg["env"].get("num_one_step_observations")
+    scales, blind = normalization["obs_scales"], 9 + 3 * len(joints)
+    grid = {axis: terrain.get(f"measured_points_{axis}") or [] for axis in "xy"}
+    with_velocity = ("lin_vel", *BLIND_TERMS)
+    layouts = {0: BLIND_TERMS, 2: (*BLIND_TERMS, "clock")}
+    layouts |= {3 + len(grid["x"]) * len(grid["y"]): (*with_velocity, "scan"), 3: with_velocity}
+    names = _HIM_TERMS if row == blind else layouts.get(width - blind, ())
+    if row == blind:
+        source.set(history={"length": width // row, "newest": "first", "by": "row", "fill": "zeros"})
+    factors = _read_scales(scales) | {"scan": scales.get("height_measurements")}
+    terms = make_terms(names, factors, scan={**grid, "order": "y fastest", "offset": 0.5, "clip": 1.0})
+    usual = f"as legged_gym, unitree_rl_gym or HIMLoco order {width} columns"
+    gap = f"its {width} columns in its order, with scale; no usual observation is so wide"
+    source.set(observation=terms or None, reason=usual if terms else gap)
+    weights = find_checkpoint(path.parent, "policy*.pt")
+    if weights.name.startswith("model_"):
+        source.set(activation=read_activation(cfg) or "elu", reason="elu is usual in legged_gym")
+    return weights
+
+
+def read_booster(path: Path, source: Source) -> Path:
+    """Settings of either YAML, whose lists end with the legs, and the observation that the code of both has."""
+    cfg = read_yaml(path)
+    joints = source.joints
+    if "policy" in cfg:
+        values = {name: cfg["common"][key][-len(joints) :] for name, key in _DEPLOYED.items()}
+        cfg |= cfg["policy"] | cfg["common"]
+    else:
+        tables = {name: cfg["control"][name] for name in _GAINS}
+        tables["default_joint_pos"] = cfg["init_state"]["default_joint_angles"]
+        values = {name: source.match_parts(table, name) for name, table in tables.items()}
+        cfg |= cfg["env"] | cfg["sim"]
+        cfg["gait_frequency"] = sum(cfg["commands"]["gait_frequency"]) / 2.0
+        cfg["policy_path"] = f"deploy/models/{path.stem}.pt"
+    source.move(values, {name: name for name in values}, joints)
+    if "mech" in cfg:
+        source.reasons["damping"] = "of the ankles' parallel motors; envs/T1.yaml of the training has the joints'"
+    control, scales, count = cfg["control"], cfg["normalization"], cfg["num_actions"]
+    if cfg["num_observations"] != 11 + 3 * count:
+        raise ValueError(f"num_observations must be {11 + 3 * count}, got {cfg['num_observations']}")
+    source.set(physics_dt=cfg["dt"], decimation=control["decimation"], action_scale=control["action_scale"])
+    source.set(action_clip=scales["clip_actions"])
+    source.set(joints=list(joints[-count:]), reason="the model's last ones, as in its deployment")
+    clock = {"period_s": 1.0 / cfg["gait_frequency"], "order": "cos sin"}
+    terms = make_terms(_BOOSTER_TERMS, _read_scales(scales) | {"gravity": scales["gravity"]}, clock=clock)
+    source.set(observation=terms, reason="the order of its code, whose low pass of commands and targets is left out")
+    return source.find_weights(cfg["policy_path"])
+
+
+def _read_scales(scales: dict[str, Any]) -> dict[str, Any]:
+    """Scales of terms by legged_gym's names, in which a command has those of velocities."""
+    names = {"lin_vel": "lin_vel", "ang_vel": "ang_vel", "joint_pos": "dof_pos", "joint_vel": "dof_vel"}
+    command = [scales["lin_vel"], scales["lin_vel"], scales["ang_vel"]]
+    return {"command": command} | {term: scales[name] for term, name in names.items()}
