@@ -28,12 +28,9 @@ class EliteTerrain(NamedTuple):
     """The terrain of an elite, by its number, or its minimal terrain."""
 
     number: int
-    genes: NDArray[np.float32]
-    """Shape (num_genes,)."""
-    cause: str
-    """What stops the robot; empty if nothing does, or nobody knows."""
-    minimal: dict[str, Any] | None
-    """Entry of a minimal terrain in ``minimal.json``."""
+    genes: NDArray[np.float32]  # shape (num_genes,)
+    cause: str  # what stops the robot; empty if nothing does, or nobody knows
+    minimal: dict[str, Any] | None  # entry of a minimal terrain in minimal.json
 
     @property
     def stem(self) -> str:
@@ -50,12 +47,10 @@ class EliteTerrain(NamedTuple):
 class OpenedRun:
     """An archive, its robot, and the search that made it."""
 
-    path: Path
-    """A run directory or an archive file."""
+    path: Path  # a run directory or an archive file
     archive: Archive
     robot: RobotCfg
-    minima: MinimalTerrains | None = None
-    """The minimal terrains of its elites, if there are some."""
+    minima: MinimalTerrains | None = None  # of its elites, if there are some
     likely: Mapping[str, Disturbance] = field(default_factory=dict)
     """How conditions are distributed; empty where that is not known."""
 

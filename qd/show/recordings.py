@@ -32,16 +32,12 @@ _LOT = 32  # terrains crossed side by side on a GPU
 class CrossingRequest:
     """A controller's crossings of one terrain. Requests are equal if their crossings are."""
 
-    label: str = field(compare=False)
-    """Of the terrain."""
-    terrain: Terrains = field(compare=False)
-    """One row."""
+    label: str = field(compare=False)  # of the terrain
+    terrain: Terrains = field(compare=False)  # one row
     policy: str
     replicas: int = 20
-    seed: int = field(default=0, compare=False)
-    """What the terrain's seed was drawn with, for the record."""
-    terrain_key: str = field(init=False)
-    """Hash of the terrain and its seed."""
+    seed: int = field(default=0, compare=False)  # what the terrain's seed was drawn with, for the record
+    terrain_key: str = field(init=False)  # hash of the terrain and its seed
 
     def __post_init__(self) -> None:
         (digest,) = self.terrain.digests()

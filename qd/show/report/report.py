@@ -1,4 +1,4 @@
-"""One page about a run: what is known of it, and robots that cross its worst terrains for the page."""
+"""One page about a search, with robots that cross its worst terrains for it, or about the rounds of a hardening."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.evaluate.tables import read_tables
+from qd.evaluate.tables import as_tables, read_tables
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
 from qd.faults.numbers import MinimalTerrains, describe_witness, fault_numbers, further_rates
@@ -18,14 +18,16 @@ from qd.show.elites import OpenedRun, open_run
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.recordings import Recordings, request_elite
 from qd.show.report import page
-from qd.show.report.evaluation import compare_controllers, write_rounds
 from qd.workers.compute import check_policy, choose_device
 from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
+from sim.files.atomic import read_json
+from sim.files.command import command_line
 from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.provenance import without_machine
 from sim.rates import SUCCESS, rate_labels
 from sim.recording.recorder import Recording
 from sim.recording.renderer import open_context
+from sim.robots.find import get_robot
 
 _OTHER_CAUSES = 3  # beside those of the first pictures; one terrain of each is shown
 _MAX_BARS = 10
@@ -63,8 +65,10 @@ def write_report(
     device = choose_device(device)
     compared = None
     if tables is not None:
-        file = without_machine(str(tables))
-        compared = compare_controllers(read_tables(tables, opened_run.robot), file=file, searched=archive.policy_sha256)
+        content = read_tables(tables, opened_run.robot)
+        hashes = {about["sha256"] for about in content["controllers"].values()}
+        of_searched = archive.policy_sha256 is None or archive.policy_sha256 in hashes
+        compared = {"file": without_machine(str(tables)), "tables": content, "of_searched": of_searched}
     content = collect_content(opened_run, ranking, controller, is_searched=not suffix)
     heads, others = _choose_elites(ranking, num_elites)
     cases: dict[int, dict[str, Any]] = {}
@@ -91,12 +95,10 @@ def write_report(
 def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[int]]:
     """The worst elites, failing ones if there are any, and the worst of some other causes."""
     rows = ranking.order()[:num_elites]
-    failing = rows[ranking.failing[rows]]
-    rows = failing if len(failing) else rows
+    rows = rows[ranking.failing[rows] | ~ranking.failing[rows].any()]
     causes = {ranking.causes[row] for row in rows}
     others = [members[0] for cause, members in ranking.by_cause().items() if cause not in causes][:_OTHER_CAUSES]
-    numbers = ranking.numbers
-    return numbers[rows].tolist(), [int(numbers[row]) for row in others]
+    return ranking.numbers[rows].tolist(), [int(ranking.numbers[row]) for row in others]
 
 
 def cross_cases(
@@ -106,12 +108,11 @@ def cross_cases(
 
     ``heads`` are crossed by their best certifier too, if they have one; ``others`` are shown in short.
     """
-    archive = run.archive
     files = run.certifiers()
     certifiers = {number: name for number in heads if (name := run.certifier(number)) is not None}
     crossings = [(number, policy) for number in (*heads, *others)]
     crossings += [(number, files[name]) for number, name in certifiers.items()]
-    requests = [request_elite(archive, number, policy=controller) for number, controller in crossings]
+    requests = [request_elite(run.archive, number, policy=controller) for number, controller in crossings]
     recorded = dict(zip(crossings, Recordings(run.robot, device=device).record(requests), strict=True))
     cases = {}
     with Bar("drawing", len(heads) + len(others)) as bar:
@@ -122,6 +123,7 @@ def cross_cases(
                 ghost = None if name is None else (name, recorded[number, files[name]])
                 cases[number] = case = _make_case(run, ranking, number, recording, ghost, pictured)
                 if number in heads:
+                    archive = run.archive
                     title = f"{archive.robot}, elite {number} of {len(archive):,}: {case['rate'].count} episodes"
                     case["figure"] = page.encode_picture(draw_crossing(recording, title))
             bar.move_to(done)
@@ -274,3 +276,40 @@ def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:
         for entry in minima.numbers["elites"]
     ]
     return {"rows": [*enumerate(rows)], "wide": (3, 5, 6)}
+
+
+def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
+    """Writes the page about the rounds of a hardening; returns its file."""
+    content = _read_rounds(run, robot)
+    out = out or run / "report.html"
+    page.check_page(out)
+    values = {
+        "choices": {},
+        **{name: content[name] for name in ("robot", "rounds", "tables", "choices") if name in content},
+    }
+    return page.publish_page(
+        out,
+        "rounds.html",
+        run=without_machine(str(run)),
+        origin=page.origin_rows(content),
+        report_command=lambda search: command_line("report", robot=robot, run=run / search),
+        **values,
+    )
+
+
+def _read_rounds(run: Path, robot: str | None) -> dict[str, Any]:
+    file = run / ROUNDS_FILE
+    content = read_json(file)
+    if not content.get("rounds"):
+        raise ValueError(f"{file} must have a search that is over, got none: let the hardening go on")
+    try:
+        content["tables"] = as_tables({"robot": content["robot"], **content["tables"]})
+        if not all({"controller", "search", "certifiers", "faults"} <= set(row) for row in content["rounds"]):
+            raise ValueError("a round lacks a name")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} must be of `faultline harden`, got another or a damaged file: {error}") from None
+    if robot is not None and get_robot(robot).name != content["robot"]:
+        raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
+    for row in content["rounds"]:  # without a specialist faults are by the panel
+        row["faults"] = row.get("faults_panel") if row["faults"] is None else row["faults"]
+    return content

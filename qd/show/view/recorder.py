@@ -64,21 +64,22 @@ class RecordingWorker:
 
 
 class Recorder:
-    """Does the last request of each key, the oldest first; requests that are not begun are replaced."""
+    """Does the last request of each key, the oldest first; requests that are not begun are replaced.
+
+    ``robot`` is that of all tasks, set before the first one; ``report`` is called in another thread at every step
+    forward. The process imports ``build`` by its name, and calls it for what works there.
+    """
 
     def __init__(self, *, build: Callable[[Event, int], Any] = RecordingWorker) -> None:
-        """The process imports ``build`` by its name, and calls it for what works there."""
         self.robot: Any = None
-        """Robot of all tasks; set before the first one."""
         self.report: Callable[[TaskProgress], None] = lambda progress: None
-        """Called in another thread, at every step forward."""
         self._build = build
         self._cancelled = CONTEXT.Event()
         self._requests: dict[Hashable, Any] = {}  # by key, the oldest first
         self._current: Any = None
         self._stopped = False
         self._changed = threading.Condition()
-        self._worker = self._start_process()
+        self._start_process()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -108,9 +109,9 @@ class Recorder:
     def _withdraw(self, task: Any) -> None:
         self._requests = {key: request for key, request in self._requests.items() if request != task}
 
-    def _start_process(self) -> WorkerProcess:
+    def _start_process(self) -> None:
         self._is_ready = False
-        return WorkerProcess(1, self._build, self._cancelled)
+        self._worker = WorkerProcess(1, self._build, self._cancelled)
 
     def _run(self) -> None:
         while True:
@@ -133,7 +134,7 @@ class Recorder:
                     if self._stopped:
                         return
                     self._worker.stop()
-                    self._worker = self._start_process()
+                    self._start_process()
                 result = error
             with self._changed:
                 self._current = None
