@@ -122,10 +122,7 @@ class OpenedRun:
         return "" if is_searched else label_suffix(policy)
 
     def certifiers(self) -> dict[str, str]:
-        """Files of the controllers that crossed its failing elites, by their names, as far as they exist.
-
-        They are of the robot's panel, of the run, or beside a published run.
-        """
+        """Files of its certifiers by name, as far as they exist: of the panel, the run, or beside a published run."""
         names = dict(zip(self.archive.certifier_sha256, self.archive.certifiers, strict=True))
         files = [*controllers_in(self.robot.panel).values(), *controllers_in(self.folder / CERTIFIERS_FOLDER).values()]
         files.append(str(self.folder.parent / f"{self.folder.name}.pt"))
@@ -136,10 +133,7 @@ class OpenedRun:
         return best_certifier(self.archive, number, self.certifiers())
 
     def terrains(self, elite: str = "", minimal: str | None = None) -> list[EliteTerrain]:
-        """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``.
-
-        Without a number it is the worst elite.
-        """
+        """The terrains of elites, the worst one if none is named, or minimal terrains: numbers, or ``all``."""
         genes: Any = self.archive.genes
         if minimal is None:
             if not elite and len(self.archive):

@@ -28,10 +28,7 @@ _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 def export_elites(
     opened_run: OpenedRun, elite: str = "", minimal: str | None = None, *, out: Path | None = None, **options: Any
 ) -> list[Path]:
-    """Writes elites of an archive or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
-
-    ``options`` may have ``formats``, all by default, and ``overwrite``.
-    """
+    """Writes elites or minimal terrains; ``options`` may have ``formats``, all by default, and ``overwrite``."""
     archive, space = opened_run.archive, opened_run.space
     if space.has_conditions:
         got = f"terrains of {archive.space}, which are crossed under conditions: replay or film them instead"

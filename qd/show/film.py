@@ -128,10 +128,7 @@ def render_pictures(
     shadows: bool = True,
     progress: Progress | None = None,
 ) -> Iterator[Picture]:
-    """The pictures of a film, each at a time of the episode [s], of a size [pixels].
-
-    Small ones are rendered twice as fine. A map has all paths, the shown one in the colour of how it ended.
-    """
+    """The pictures of a film at times of the episode [s], of a size [pixels], small ones rendered twice as fine."""
     recording = shot.recording
     ghost_name, ghost = shot.beside or ("", None)
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
@@ -253,8 +250,7 @@ def film_source(
 ) -> list[Path]:
     """Films of terrains; all is crossed and stored before the first is made.
 
-    ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file, or
-    ``witness``, the controller that crosses the elite where it is steered;
+    ``beside`` names a ghost: a certifier, one of the panel, a file, or ``witness``, which is steered on the elite.
     ``look`` may have ``whole`` and ``shadows`` of :func:`film`.
     """
     if not gif and out is not None and out.suffix == ".gif":

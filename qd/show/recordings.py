@@ -61,10 +61,7 @@ def request_elite(
     seed: int = 0,
     **crossing: Any,
 ) -> CrossingRequest:
-    """The crossings of an elite that ``faultline replay`` shows, by a ``policy`` in ``replicas`` episodes.
-
-    ``minimal`` are genes to cross in place of the elite's, from the same starts.
-    """
+    """The crossings of an elite that ``faultline replay`` shows, or of ``minimal`` genes from the same starts."""
     genes = archive.genes[number] if minimal is None else minimal
     seeds = episode_seeds(seed, number, 1, stream=Stream.RECORDED_ELITE)
     terrain = Terrains(genes=genes[None], seeds=seeds, space=archive.terrain_space)

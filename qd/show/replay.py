@@ -111,10 +111,7 @@ class ReplaySource:
 def source_from_run(
     opened_run: OpenedRun, elite: str = "", minimal: str | None = None, *, policy: str | None = None, **crossing: Any
 ) -> ReplaySource:
-    """Elites of a run or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
-
-    ``crossing`` may have ``replicas`` and ``seed``.
-    """
+    """Elites of a run or their minimal terrains; ``crossing`` may have ``replicas`` and ``seed``."""
     crossing["policy"] = opened_run.policy(policy)
     suffix = opened_run.suffix(crossing["policy"])
 

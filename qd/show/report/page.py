@@ -97,10 +97,7 @@ def origin_rows(origin: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any]:
-    """Terrains of genes, shape (T, num_genes), at least one, from above in one image, so that large pages are light.
-
-    ``source`` is the image; ``offsets`` are pixels from its left and top to each terrain. Blue is low, brown high.
-    """
+    """At least one terrain, genes (T, num_genes), from above in one image; ``offsets`` are pixels from left and top."""
     columns = math.ceil(math.sqrt(len(genes) / 2))  # about a square, as a tile is twice as wide as high
     image = Image.new("RGB", (columns * TILE[0], -(-len(genes) // columns) * TILE[1]))
     offsets = [(k % columns * TILE[0], k // columns * TILE[1]) for k in range(len(genes))]
