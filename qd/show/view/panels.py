@@ -1,7 +1,4 @@
-"""The panels of a tab, the archive left and the crossing right, the bar below, a tab's selection, clock and address.
-
-A panel posts what a visitor does to the viewer's loop, which calls the :class:`qd.show.view.tab.Tab`.
-"""
+"""A tab's panels and bar, which post what a visitor does to the viewer's loop, and its selection, clock and address."""
 
 import json
 import math
@@ -34,8 +31,7 @@ _SCRIPT = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 _WIDTH = 360  # of a panel [pixels]
 _NARROW_WIDTH = 300
 _WIDE = 1300  # a narrower window has no room for two wide panels, and the archive is folded [pixels]
-TERRAINS = ("whole", "minimal")
-"""Terrains of an elite to choose from."""
+TERRAINS = ("whole", "minimal")  # of an elite, to choose from
 _CURVE_POINTS = 300
 _HOLD_S = 1.5  # real time from the end of a crossing that plays to its next begin
 _KEYS = """- **Space** play or pause
@@ -65,10 +61,7 @@ class Selection:
         self.matching = self._show.list_elites(**self._choice)
 
     def step(self, by: int) -> int:
-        """Number of the next (1) or previous (-1) elite of the list; the picked one at the end of the list.
-
-        A picked elite that is not listed has the neighbours of its position among all elites.
-        """
+        """Number of the next (1) or previous (-1) listed elite by its position among all; the picked one at the end."""
         positions = np.argsort(self._show.list_elites(**self._choice | {"cause": ""}))  # of each elite
         ahead = positions[self.matching] - positions[self.picked]
         near = self.matching[ahead > 0][:1] if by > 0 else self.matching[ahead < 0][-1:]
@@ -187,9 +180,8 @@ class CrossingPanel:
         self.controller = _add_choice(gui, "Controller", controllers or ("none",), partial(post, tab.choose_controller))
         self.ghost = _add_choice(gui, "Ghost", tab.ghost_choices, partial(post, tab.choose_ghost))
         self.controller.disabled = self.ghost.disabled = not controllers
-        self.terrain = _add_choice(
-            gui, "Terrain", TERRAINS, lambda label: post(tab.choose_terrain, label == TERRAINS[1])
-        )
+        choose_terrain = partial(post, tab.choose_terrain)
+        self.terrain = _add_choice(gui, "Terrain", TERRAINS, lambda label: choose_terrain(label == TERRAINS[1]))
         self.rates = gui.add_html("")
         kinds = [PENALTIES[name] for name in tab.show.archive.penalties]
         series = [uplot.Series(label=kind.label, stroke=kind.color, width=2.0) for kind in kinds]
@@ -229,13 +221,12 @@ class CrossingPanel:
 
 
 class PlayerBar:
-    """The player bar under the scene: it shows values in the browser, and sends back what a visitor does.
+    """The player bar under the scene, where viser has no element: ``page.js`` draws it and sends what a visitor does.
 
-    ``page.js`` draws the bar, since viser has no element under the scene. It also sends keys and clicks on elites.
+    ``act`` is called in another thread with the name and value of each action, of keys and clicks on elites too.
     """
 
     def __init__(self, client: viser.ClientHandle, act: Callable[[str, Any], None]) -> None:
-        """Add the bar; ``act`` is called in another thread with the name and value of each action of a visitor."""
         self._client = client
         self._act = act
         self.shown: dict[str, Any] = {}  # values by their names in page.js

@@ -18,13 +18,10 @@ _PREPARING = "the simulation is built; the very first one compiles its kernels, 
 class TaskProgress(NamedTuple):
     """How far a task is."""
 
-    task: Any
-    """A :class:`qd.show.recordings.CrossingRequest`, or a film: a partial call of :func:`qd.show.film.film`."""
-    text: str = ""
-    """An error, or what the process does where its share does not say it."""
+    task: Any  # a qd.show.recordings.CrossingRequest, or a film: a partial call of qd.show.film.film
+    text: str = ""  # an error, or what the process does where its share does not say it
     share: float = 0.0
-    result: Any = None
-    """The recording, or the film's file, when it is done."""
+    result: Any = None  # the recording, or the film's file, when it is done
     failed: bool = False
 
 
@@ -94,7 +91,7 @@ class Recorder:
     def cancel(self, task: Any) -> None:
         """Drop a task, even while it runs."""
         with self._changed:
-            self._withdraw(task)
+            self._requests = {key: request for key, request in self._requests.items() if request != task}
             if self._current is not None and self._current == task:
                 self._cancelled.set()
 
@@ -105,9 +102,6 @@ class Recorder:
             self._worker.stop()
             self._changed.notify()
         self._thread.join(timeout=10)
-
-    def _withdraw(self, task: Any) -> None:
-        self._requests = {key: request for key, request in self._requests.items() if request != task}
 
     def _start_process(self) -> None:
         self._is_ready = False
@@ -139,8 +133,8 @@ class Recorder:
             with self._changed:
                 self._current = None
                 self._cancelled.clear()
-                if result is not None:
-                    self._withdraw(task)  # other keys may have requested the same meanwhile
+            if result is not None:
+                self.cancel(task)  # other keys may have requested the same meanwhile
             if isinstance(result, Exception):
                 self.report(TaskProgress(task=task, text=str(result), failed=True))
             elif result is not None:

@@ -28,16 +28,13 @@ from sim.terrains.maps.heightmap import surface_of
 from sim.terrains.maps.picture import height_colors, places, tinted
 from sim.terrains.terrains import GroundMaps, asked_of
 
-FORCE_COLOR = (0.84, 0.10, 0.11)
-"""Arrows of contact forces, RGB, 0 to 1."""
-COMMAND_COLOR = (0.0, 0.62, 0.45)
-"""Arrow of the commanded velocity."""
+FORCE_COLOR = (0.84, 0.10, 0.11)  # arrows of contact forces, RGB, 0 to 1
+COMMAND_COLOR = (0.0, 0.62, 0.45)  # arrow of the commanded velocity
 _GOAL_COLOR = (0, 158, 115)
 SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, None]
 """Background, blue above and pale below, as an image of one column."""
 _BEHIND = np.array([-1.6, -2.4, 1.5])  # from the robot to the camera that follows it [m]
-PHONE = 576
-"""Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
+PHONE = 576  # below this width viser's panels cover the lower 60 % of the picture [pixels]
 _START_RADIUS = 0.25
 _DISC: Any = {"height": 0.02, "opacity": 0.5, "cast_shadow": False}
 
@@ -66,8 +63,7 @@ _COMMAND_HEIGHT = 0.45  # over the base [m]
 class Crossing(NamedTuple):
     """One episode as it is shown, F frames."""
 
-    recording: Recording
-    """Of one terrain."""
+    recording: Recording  # of one terrain
     replica: int
     positions: NDArray[np.float64]
     """Origins of the bodies, world [m], shape (F, num_bodies, 3)."""
@@ -108,10 +104,7 @@ class Crossing(NamedTuple):
 def trace_crossing(
     recording: Recording, replica: int, skeleton: Skeleton, scales: Mapping[str, float]
 ) -> Crossing | None:
-    """One episode of a recording of one terrain; None if it broke before its first frame.
-
-    The penalties that ``scales`` names are shown, divided by them.
-    """
+    """One episode, with the penalties that ``scales`` names over them; None if it broke before its first frame."""
     frames = int(recording.num_frames[0, replica])
     if frames == 0:
         return None

@@ -29,9 +29,8 @@ _BAR_S = 0.1  # real time from one update of the bar's time to the next, while p
 _ADDRESS_S = 1.0  # real time from one update of the address to the next; browsers allow three a second
 _SETTLE_S = 3.0  # a new browser may still send where its camera stood before it was moved
 _LEAD_S = 1.0  # an episode is shown from so long before the robot fails
-CERTIFIER = "who certifies it"
+CERTIFIER = "who certifies it"  # a ghost to choose: the certifier of the elite, if it is at hand
 NO_GHOST = "none"
-"""Ghosts to choose beside the controllers: the certifier of the elite, if it is at hand, and none."""
 
 
 class Shared(NamedTuple):
@@ -42,8 +41,7 @@ class Shared(NamedTuple):
     shapes: list[BodyShape]
     recordings: Recordings
     recorder: Recorder
-    post: Callable[..., None]
-    """Has the loop call a function with arguments."""
+    post: Callable[..., None]  # has the loop call a function with arguments
 
 
 @dataclass(eq=False)

@@ -128,14 +128,14 @@ class ViewedRun(OpenedRun):
         """All else that is known of an elite, as Markdown."""
         ranking = self.ranking
         kin = int((ranking.families == ranking.families[number]).sum()) - 1
+        minimal = "" if self.minima is None or number not in self.minima.genes else self.minima.describe(number)
+        found = f"{self.archive.fitness[number]:.2f} as found in iteration {self.archive.iteration[number]}"
         paragraphs = [
+            *[f"**Minimal terrain**: {minimal}."] * bool(minimal),
             *describe_judgement(self.archive, number),
             f"{kin or 'No'} other elite{'s' * (kin > 1)} like it.",
-            f"Fitness **{ranking.fitness[number]:.2f}** ({self.archive.fitness[number]:.2f} as found in "
-            f"iteration {self.archive.iteration[number]}): {FITNESS_TEXT}.",
+            f"Fitness **{ranking.fitness[number]:.2f}** ({found}): {FITNESS_TEXT}.",
         ]
-        if self.minima is not None and number in self.minima.genes:
-            paragraphs.insert(0, f"**Minimal terrain**: {self.minima.describe(number)}.")
         return "\n\n".join(paragraphs)
 
 
