@@ -7,15 +7,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from sim.controllers.spec import parse_controllers
-from sim.files.command import (
-    ControllerFlags,
-    DeviceFlag,
-    EliteFlags,
-    RobotFlag,
-    SpaceFlag,
-    WorkerFlags,
-    split_values,
-)
+from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt
 from sim.robots.find import get_robot
 

@@ -143,8 +143,8 @@ def draw_minimal(
     grids, grounds = make_terrains(np.array([genes[entries[index]["elite"]] for index in shown]), space)
     for panel in panels[len(shown) :]:
         panel.set_axis_off()
-    for k, (panel, index) in enumerate(zip(panels, shown, strict=False)):
-        entry = entries[index]
+    for k, index in enumerate(shown):
+        panel, entry = panels[k], entries[index]
         ground = None if grounds is None else grounds[k : k + 1]
         panel.imshow(relief(grids[k], ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH))
         title = f"elite {entry['elite']}: {causes[index]}, {len(entry['bumps'])} of {entry['of']} parts"

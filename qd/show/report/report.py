@@ -238,18 +238,9 @@ def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
     content = _read_rounds(run, robot)
     out = out or run / "report.html"
     page.check_page(out)
-    values = {
-        "choices": {},
-        **{name: content[name] for name in ("robot", "rounds", "tables", "choices") if name in content},
-    }
-    return page.publish_page(
-        out,
-        "rounds.html",
-        run=without_machine(str(run)),
-        origin=page.origin_rows(content),
-        report_command=lambda search: command_line("report", robot=robot, run=run / search),
-        **values,
-    )
+    content |= {"run": without_machine(str(run)), "origin": page.origin_rows(content)}
+    content["report_command"] = lambda search: command_line("report", robot=robot, run=run / search)
+    return page.publish_page(out, "rounds.html", **{"choices": {}, **content})
 
 
 def _read_rounds(run: Path, robot: str | None) -> dict[str, Any]:

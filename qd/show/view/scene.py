@@ -104,7 +104,7 @@ class Crossing(NamedTuple):
 def trace_crossing(
     recording: Recording, replica: int, skeleton: Skeleton, scales: Mapping[str, float]
 ) -> Crossing | None:
-    """One episode, with the penalties that ``scales`` names over them; None if it broke before its first frame."""
+    """One episode, its penalties divided by their ``scales``; None if it broke before its first frame."""
     frames = int(recording.num_frames[0, replica])
     if frames == 0:
         return None
