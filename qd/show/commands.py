@@ -7,15 +7,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from sim.controllers.spec import parse_controllers
-from sim.files.command import (
-    ControllerFlags,
-    DeviceFlag,
-    EliteFlags,
-    RobotFlag,
-    SpaceFlag,
-    WorkerFlags,
-    split_values,
-)
+from sim.files.command import ControllerFlags, DeviceFlag, EliteFlags, RobotFlag, SpaceFlag, WorkerFlags, split_values
 from sim.files.settings import NonNegativeInt, PositiveInt
 from sim.robots.find import get_robot
 
@@ -92,8 +84,8 @@ class FilmCommand(ReplayCommand):
         from qd.show.film import film_source
         from qd.workers.compute import choose_device
 
-        look: Any = {"gif": self.gif, "beside": self.beside, "whole": self.whole, "shadows": self.shadows}
-        film_source(self._source(), device=choose_device(self.device), out=self.out, episode=self.episode, **look)
+        look: Any = {name: getattr(self, name) for name in ("out", "episode", "gif", "beside", "whole", "shadows")}
+        film_source(self._source(), device=choose_device(self.device), **look)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,12 +171,11 @@ class ExportCommand(ControllerFlags, EliteFlags):
         run = find_run(robot, self.run, published="never")
         named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space}
         searches = [find_search(one, **named) for one in (run, *making.runs)]
-        apart_from = [read_archive(one) for one in making.apart_from]
         controllers = parse_controllers(making.controllers, robot) if making.controllers else {}
-        compute = Compute.resolve(making.device, making.workers, making.num_envs)
-        sizes: Any = {name: getattr(making, name) for name in ("size", "episodes", "seed", "licence")}
-        how: Any = {"compute": compute, "apart_from": apart_from, "overwrite": self.overwrite, "out": self.out}
-        make_pack(searches, controllers, **how, **sizes)
+        how: Any = {name: getattr(making, name) for name in ("size", "episodes", "seed", "licence")}
+        how |= {"compute": Compute.resolve(making.device, making.workers, making.num_envs), "out": self.out}
+        how |= {"apart_from": [read_archive(one) for one in making.apart_from], "overwrite": self.overwrite}
+        make_pack(searches, controllers, **how)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,21 +207,19 @@ class ReportCommand(ControllerFlags, DeviceFlag, SpaceFlag):
 
     def execute(self) -> None:
         """Writes the page."""
-        if self.evidence is not None or self.verify is not None:
-            if (self.evidence is not None and self.verify is not None) or self.evidence == ():
-                raise ValueError("report takes files behind --evidence, or a list behind --verify, got none or both")
-            from qd.show.report.evidence import verify_evidence, write_evidence
-
-            if self.verify is not None:
-                count = verify_evidence(self.verify)
-                print(f"{count} files are as {self.verify} says. That does not say who wrote them.")
-            elif self.evidence is not None:
-                write_evidence(self.evidence, robot=self.robot, controller=self.controller, out=self.out)
-            return
+        from qd.show.report.evidence import verify_evidence, write_evidence
         from qd.show.report.report import write_report
 
-        named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space, "device": self.device}
-        write_report(self.run, out=self.out, num_elites=self.elites, tables=self.tables, **named)
+        if self.evidence == () or None not in (self.evidence, self.verify):
+            raise ValueError("report takes files behind --evidence, or a list behind --verify, got none or both")
+        if self.verify is not None:
+            count = verify_evidence(self.verify)
+            print(f"{count} files are as {self.verify} says. That does not say who wrote them.")
+        elif self.evidence is not None:
+            write_evidence(self.evidence, robot=self.robot, controller=self.controller, out=self.out)
+        else:
+            named: Any = {"robot": self.robot, "policy": self.policy, "space": self.space, "device": self.device}
+            write_report(self.run, out=self.out, num_elites=self.elites, tables=self.tables, **named)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,14 +22,12 @@ from sim.terrains.terrains import asked_of
 
 
 class Ending(NamedTuple):
-    """How an episode ended, with a label and looks that the colour-blind tell apart."""
+    """How an episode ended, with a label and looks that the colour-blind tell apart: Okabe and Ito's colours."""
 
     label: str
     color: str = "#5a5a5a"
-    """As ``#rrggbb`` (Okabe and Ito's)."""
     marker: str = ""
-    line: str = ""
-    """Matplotlib's, of the path."""
+    line: str = ""  # of the path
 
 
 _LOOKS = {
@@ -94,9 +92,8 @@ def find_failure_time(recording: Recording, episode: int) -> float:
     A robot that ran out of time without a fall got stuck when it first came within 0.3 m of where it ended. Of every
     other episode it is the end. A fall is the one from which the robot did not rise.
     """
-    last = max(int(recording.num_frames[0, episode]) - 1, 0)
+    frame = last = max(int(recording.num_frames[0, episode]) - 1, 0)
     outcome = recording.outcome[0, episode]
-    frame = last
     if outcome in (Outcome.BASE_COLLISION, Outcome.TIME_OUT, Outcome.OUT):
         upright = np.flatnonzero(~leans(recording, episode))
         fall = int(upright[-1]) + 1 if len(upright) else 0
@@ -128,8 +125,6 @@ def find_ghost_episode(recording: Recording, episode: int, scales: dict[str, flo
 
 def draw_time_line(acting: Sequence[tuple[str, float, float]], recording: Recording) -> Figure:
     """What acts on the robots of one terrain, from when to when [s], and when their episodes went wrong."""
-    outcome = recording.outcome[0]
-    failed = np.flatnonzero((outcome != Outcome.GOAL) & (outcome != Outcome.INVALID))
     figure = new_figure(11.0, 0.8 + 0.45 * len(acting))
     axes = figure.subplots()
     for row, (_, first, last) in enumerate(acting):
@@ -137,7 +132,7 @@ def draw_time_line(acting: Sequence[tuple[str, float, float]], recording: Record
             axes.plot([first], [row], "v", color="#d55e00")
         else:
             axes.barh(row, last - first, left=first, height=0.6, color="#56b4e9")
-    for episode in failed:
+    for episode in np.flatnonzero(~np.isin(recording.outcome[0], (Outcome.GOAL, Outcome.INVALID))):
         axes.axvline(find_failure_time(recording, int(episode)), color="#000000", alpha=0.3, linewidth=1.0)
     labels = [textwrap.fill(text, 52) for text, *_ in acting]
     axes.set_yticks(range(len(acting)), labels=labels, fontsize="small")
@@ -149,7 +144,7 @@ def draw_time_line(acting: Sequence[tuple[str, float, float]], recording: Record
 def make_title(recording: Recording, controller: str = "") -> str:
     """A terrain and how most episodes ended on it: ``ANYmal C, elite 313 (trench): topples, 19 of 20``."""
     robot = ROBOTS[recording.robot].label if recording.robot in ROBOTS else recording.robot
-    head = robot + (f" with {controller}" if controller else "") + f", {recording.labels[0]}"
+    head = robot + f" with {controller}" * bool(controller) + f", {recording.labels[0]}"
     outcome = recording.outcome[0]
     valid = outcome != Outcome.INVALID
     if not valid.any():
@@ -168,8 +163,14 @@ def draw_crossing(recording: Recording, title: str) -> Figure:
     figure.suptitle(title)
     top, profile = panels = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 0.9))
     ground = recording.ground
-    image = draw_heights(top, recording.heights[0], ground)
-    figure.colorbar(image, ax=panels, label="height [m]", shrink=0.5, anchor=(0.0, 1.0), pad=0.01)
+    figure.colorbar(
+        draw_heights(top, recording.heights[0], ground),
+        ax=panels,
+        label="height [m]",
+        shrink=0.5,
+        anchor=(0.0, 1.0),
+        pad=0.01,
+    )
     handles = [*_draw_paths(top, recording), *(Line2D([], [], **MARKS[name]) for name in places(asked_of(ground)))]
     if ground is not None:
         patches = {"slippery": (SLIPPERY, ground.friction < 1.0), "soft": (SOFT, ground.time_constant_s > 0.0)}
@@ -193,13 +194,12 @@ def _draw_paths(axes: Axes, recording: Recording) -> list[Any]:
         paths = [recording.qpos(0, k)[:, :2] for k in np.flatnonzero(recording.outcome[0] == outcome).tolist()]
         if not paths:
             continue
+        mark: dict[str, Any] = {"color": ending.color, "marker": ending.marker}
         for path in paths:
             axes.plot(*path.T, color=ending.color, linestyle=ending.line, linewidth=0.9, alpha=0.7)
-        mark: dict[str, Any] = {"color": ending.color, "marker": ending.marker}
-        ends = np.stack([path[-1] for path in paths], axis=1)
-        axes.scatter(*ends, s=55, edgecolors="white", zorder=3, **mark)
+            xs += path[:, 0].tolist()
+        axes.scatter(*np.stack([path[-1] for path in paths], axis=1), s=55, edgecolors="white", zorder=3, **mark)
         mark |= {"linestyle": ending.line, "markeredgecolor": "white", "markersize": 9}
         handles.append(Line2D([], [], **mark, label=f"{ending.label} ({len(paths)})"))
-        xs += np.concatenate(paths)[:, 0].tolist()
     axes.set_xlim(min(xs), max(xs))  # robots may leave the terrain
     return handles

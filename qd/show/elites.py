@@ -28,12 +28,9 @@ class EliteTerrain(NamedTuple):
     """The terrain of an elite, by its number, or its minimal terrain."""
 
     number: int
-    genes: NDArray[np.float32]
-    """Shape (num_genes,)."""
-    cause: str
-    """What stops the robot; empty if nothing does, or nobody knows."""
-    minimal: dict[str, Any] | None
-    """Entry of a minimal terrain in ``minimal.json``."""
+    genes: NDArray[np.float32]  # shape (num_genes,)
+    cause: str  # what stops the robot; empty if nothing does, or nobody knows
+    minimal: dict[str, Any] | None  # entry of a minimal terrain in minimal.json
 
     @property
     def stem(self) -> str:
@@ -50,12 +47,10 @@ class EliteTerrain(NamedTuple):
 class OpenedRun:
     """An archive, its robot, and the search that made it."""
 
-    path: Path
-    """A run directory or an archive file."""
+    path: Path  # a run directory or an archive file
     archive: Archive
     robot: RobotCfg
-    minima: MinimalTerrains | None = None
-    """The minimal terrains of its elites, if there are some."""
+    minima: MinimalTerrains | None = None  # of its elites, if there are some
     likely: Mapping[str, Disturbance] = field(default_factory=dict)
     """How conditions are distributed; empty where that is not known."""
 
@@ -127,10 +122,7 @@ class OpenedRun:
         return "" if is_searched else label_suffix(policy)
 
     def certifiers(self) -> dict[str, str]:
-        """Files of the controllers that crossed its failing elites, by their names, as far as they exist.
-
-        They are of the robot's panel, of the run, or beside a published run.
-        """
+        """Files of its certifiers by name, as far as they exist: of the panel, the run, or beside a published run."""
         names = dict(zip(self.archive.certifier_sha256, self.archive.certifiers, strict=True))
         files = [*controllers_in(self.robot.panel).values(), *controllers_in(self.folder / CERTIFIERS_FOLDER).values()]
         files.append(str(self.folder.parent / f"{self.folder.name}.pt"))
@@ -141,10 +133,7 @@ class OpenedRun:
         return best_certifier(self.archive, number, self.certifiers())
 
     def terrains(self, elite: str = "", minimal: str | None = None) -> list[EliteTerrain]:
-        """The terrains of elites, or if ``minimal`` is given the minimal terrains: numbers, or ``all``.
-
-        Without a number it is the worst elite.
-        """
+        """The terrains of elites, the worst one if none is named, or minimal terrains: numbers, or ``all``."""
         genes: Any = self.archive.genes
         if minimal is None:
             if not elite and len(self.archive):

@@ -28,12 +28,8 @@ _TEMPLATES = open_templates(Path(__file__).parent / "templates")
 def export_elites(
     opened_run: OpenedRun, elite: str = "", minimal: str | None = None, *, out: Path | None = None, **options: Any
 ) -> list[Path]:
-    """Writes elites of an archive or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
-
-    ``options`` may have ``formats``, all by default, and ``overwrite``.
-    """
-    archive = opened_run.archive
-    space = opened_run.space
+    """Writes elites or minimal terrains; ``options`` may have ``formats``, all by default, and ``overwrite``."""
+    archive, space = opened_run.archive, opened_run.space
     if space.has_conditions:
         got = f"terrains of {archive.space}, which are crossed under conditions: replay or film them instead"
         raise ValueError(f"a terrain file holds heights and ground, got {got}")
@@ -52,10 +48,9 @@ def export_elites(
         for row, terrain in enumerate(terrains)
     }
     origin = {"run": str(opened_run.path), "space": archive.space, "space_sha256": archive.space_sha256}
-    origin |= archive.named()
     name = _FOLDER if minimal is None else f"minimal-{_FOLDER}"
     folder = output_folder(opened_run.path, opened_run.robot.name) / name
-    return _export(about, map(build, terrains), origin, out or folder, **options)
+    return _export(about, map(build, terrains), origin | archive.named(), out or folder, **options)
 
 
 def export_pack(
@@ -67,7 +62,6 @@ def export_pack(
     pack_robot = resolve_robot(pack.content, robot, folder / PACK_FILE, kind="pack")
     indices = choose_elites(elite, range(len(pack.terrains)), f"{folder} has no place")
     rows = {pack.terrains[index]["name"]: index for index in indices}
-
     about = {name: {"robot": pack_robot.name, "place": row, **pack.terrains[row]} for name, row in rows.items()}
     keys = ("robot", "robot_sha256", "penalty_definition", "terrains_sha256")
     origin = {"pack": pack.name} | {key: pack.content[key] for key in keys}
@@ -91,8 +85,7 @@ def _export(
     """Writes terrains with what is known of them by their names, an index and how to use them."""
     formats = list(dict.fromkeys(formats))
     check_formats(formats)
-    index_file = folder / "index.json"
-    readme_file = folder / "README.md"
+    index_file, readme_file = folder / "index.json", folder / "README.md"
     stored = sorted(file.name for file in folder.glob("*") if file in (index_file, readme_file) or file.stem in about)
     if stored and not overwrite:
         names = ", ".join(stored[:3]) + ", ..." * (len(stored) > 3)

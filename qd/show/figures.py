@@ -42,10 +42,9 @@ def relief(heights: NDArray[np.floating], ground: GroundMaps | None = None) -> N
     light = np.clip(1.0 + _SUN[0] * rise_x + _SUN[1] * rise_y, 0.45, 1.25)
     colors = height_colors(heights) if ground is None else tinted(height_colors(heights), ground)
     pixels = np.clip(255.0 * colors * light[..., None], 0.0, 255.0).astype(np.uint8)
+    half = round(_MARK_M / spacing)
     for name, (x, y) in places(asked_of(ground)).items():
-        row = round(y / spacing)
-        column = round(x / spacing)
-        half = round(_MARK_M / spacing)
+        row, column = round(y / spacing), round(x / spacing)
         pixels[row - half : row + half + 1, column - half : column + half + 1] = _COLORS[name]
     return pixels
 
@@ -94,11 +93,9 @@ def draw_archive(archive: Archive) -> Figure:
     axes = figure.subplots()
     coverage = f"{archive.reachable_coverage:.1%} of {archive.cells.num_cells:,} reachable cells"
     title = f"{_title(archive)}: {len(archive):,} elites, {coverage}"
-    fitness = archive.fitness
-    ratios = archive.ratios
+    fitness, ratios = archive.fitness, archive.ratios
     if (fresh := archive.fresh) is not None:
-        fitness = fresh.fitness[fresh.valid]
-        ratios = fresh.ratios[fresh.valid]
+        fitness, ratios = fresh.fitness[fresh.valid], fresh.ratios[fresh.valid]
         title += f",\ncorrected by {FRESH_EPISODES} fresh episodes each: {fresh.reproduced.sum():,} reproduced"
     axes.set_title(title)
     order = np.argsort(fitness)  # the fittest on top
@@ -146,8 +143,8 @@ def draw_minimal(
     grids, grounds = make_terrains(np.array([genes[entries[index]["elite"]] for index in shown]), space)
     for panel in panels[len(shown) :]:
         panel.set_axis_off()
-    for k, (panel, index) in enumerate(zip(panels, shown, strict=False)):
-        entry = entries[index]
+    for k, index in enumerate(shown):
+        panel, entry = panels[k], entries[index]
         ground = None if grounds is None else grounds[k : k + 1]
         panel.imshow(relief(grids[k], ground), origin="lower", extent=(0.0, LENGTH, 0.0, WIDTH))
         title = f"elite {entry['elite']}: {causes[index]}, {len(entry['bumps'])} of {entry['of']} parts"

@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +32,10 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.maps.picture import LENGTH, height_colors, places
 from sim.terrains.terrains import asked_of
 
-FPS = 25
-"""Pictures a second of a film."""
+FPS = 25  # of a film
 _SIZE = (1280, 720)  # of a film [pixels]
-GIF_FPS = 12.5
-"""Pictures a second of a GIF; each lasts whole hundredths of a second."""
-GIF_SIZE = (480, 270)
-"""Width and height of a GIF [pixels]."""
+GIF_FPS = 12.5  # each picture lasts whole hundredths of a second
+GIF_SIZE = (480, 270)  # [pixels]
 MAX_GIF_BYTES = 2_000_000
 _COLORS = (256, 128, 96, 64, 48, 32, 16)  # of a GIF; fewer where it would be too large
 _SUPERSAMPLING = 2  # of a GIF's pictures
@@ -51,6 +47,8 @@ _CLEARANCE = 0.05  # of the line of sight over the ground [m]
 
 Picture = NDArray[np.uint8]
 """RGB, shape (height, width, 3)."""
+Progress = Callable[[float], None]
+"""Called with the share that is done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,15 +58,14 @@ class Shot:
     recording: Recording
     episode: int
     title: str = ""
-    beside: tuple[str, Recording] | None = None
-    """Name of another controller, to be shown as a ghost, and what was recorded of it from the same starts."""
+    beside: tuple[str, Recording] | None = None  # name of a ghost's controller, and its crossings from the same starts
 
-    @cached_property
+    @property
     def end(self) -> float:
         """When the episode ends [s]."""
         return self.recording.dt * (int(self.recording.num_frames[0, self.episode]) - 1)
 
-    @cached_property
+    @property
     def moment(self) -> float | None:
         """When the robot fails [s]; None if it does not."""
         outcome = self.recording.outcome[0, self.episode]
@@ -91,10 +88,8 @@ class Shot:
 
 def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
     """Between two poses in proportion, MuJoCo's coordinates, shape (7 + num_joints,); past the last one the last."""
-    index = min(int(frame), len(poses) - 1)
     share = frame - int(frame)
-    first = poses[index]
-    last = poses[min(index + 1, len(poses) - 1)].copy()
+    first, last = (poses[min(int(frame) + k, len(poses) - 1)].copy() for k in (0, 1))
     last[3:7] *= np.copysign(1.0, first[3:7] @ last[3:7])
     pose = (1.0 - share) * first + share * last
     pose[3:7] /= np.linalg.norm(pose[3:7])
@@ -131,12 +126,9 @@ def render_pictures(
     size: tuple[int, int] = GIF_SIZE,
     *,
     shadows: bool = True,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress | None = None,
 ) -> Iterator[Picture]:
-    """The pictures of a film, each at a time of the episode [s], of a size [pixels].
-
-    Small ones are rendered twice as fine. A map has all paths, the shown one in the colour of how it ended.
-    """
+    """The pictures of a film at times of the episode [s], of a size [pixels], small ones rendered twice as fine."""
     recording = shot.recording
     ghost_name, ghost = shot.beside or ("", None)
     cameras = follow(shot, times, _DISTANCE * max(robot.default_base_height, 2.0 * robot.footprint[0]))
@@ -170,7 +162,8 @@ def render_pictures(
             ImageDraw.Draw(inset).circle(_locate(chart, pose[None, :2])[0], chart.width / 40, "white", "black")
             picture.paste(inset, (size[0] - chart.width, 0))
             yield np.asarray(picture)
-            progress((number + 1) / len(times))
+            if progress is not None:
+                progress((number + 1) / len(times))
 
 
 def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> None:
@@ -195,7 +188,7 @@ def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: i
     if shot.moment is not None and time_s >= shot.moment:
         recording, row = shot.recording, (0, shot.episode)
         failure = way_to_end(recording.outcome[row], asked_of(recording.ground), fallen=bool(recording.fallen[row]))
-        write(10, 528, f"{failure} at {shot.moment:.1f} s", 30, get_ending(shot.recording, shot.episode).color)
+        write(10, 528, f"{failure} at {shot.moment:.1f} s", 30, get_ending(recording, shot.episode).color)
 
 
 def _locate(image: Image.Image, positions: NDArray[np.floating]) -> list[tuple[float, float]]:
@@ -205,26 +198,15 @@ def _locate(image: Image.Image, positions: NDArray[np.floating]) -> list[tuple[f
 
 
 def film(
-    recording: Recording,
+    shot: Shot,
     robot: RobotCfg,
-    scales: dict[str, float],
-    out: Path,
     *,
-    episode: int | None = None,
+    out: Path,
     whole: bool = False,
     shadows: bool = True,
-    by: str = "",
-    beside: tuple[str, Recording] | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress | None = None,
 ) -> None:
-    """Films an episode of a recording of one terrain as the MP4 or GIF that ``out`` is by its name.
-
-    Without an ``episode`` it is the typical one, by the ``scales`` of penalties: the seconds around the failure, or the
-    ``whole``. ``by`` names the controller, where it is not the robot's own; ``beside`` is as of a :class:`Shot`.
-    """
-    if episode is None:
-        episode = find_typical_episode(recording, scales)
-    shot = Shot(recording=recording, episode=episode, title=make_title(recording, by), beside=beside)
+    """Films the seconds around the failure, or the ``whole``, as the MP4 or GIF that ``out`` is by its name."""
     gif = out.suffix == ".gif"
     size = GIF_SIZE if gif else _SIZE
     times = shot.times(GIF_FPS if gif else FPS, whole=whole)
@@ -268,8 +250,7 @@ def film_source(
 ) -> list[Path]:
     """Films of terrains; all is crossed and stored before the first is made.
 
-    ``beside`` names another controller to show as a ghost: one of the run's certifiers or of the panel, or a file, or
-    ``witness``, the controller that crosses the elite where it is steered;
+    ``beside`` names a ghost: a certifier, one of the panel, a file, or ``witness``, which is steered on the elite.
     ``look`` may have ``whole`` and ``shadows`` of :func:`film`.
     """
     if not gif and out is not None and out.suffix == ".gif":
@@ -282,12 +263,13 @@ def film_source(
     ghost_policy = None if beside in (None, WITNESS) else find_ghost(source, beside, device)
     requests = source.steered_requests() if beside == WITNESS else source.requests(ghost_policy)
     recordings = source.record(device)
-    look |= {"episode": episode, "by": source.by}
     ghosts = source.record(device, requests) if beside is not None else []
     for recording, ghost, file in itertools.zip_longest(recordings, ghosts, files):
+        other = None if beside is None else (beside if beside == WITNESS else label_suffix(beside)[1:], ghost)
+        number = find_typical_episode(recording, source.scales) if episode is None else episode
+        shot = Shot(recording=recording, episode=number, title=make_title(recording, source.by), beside=other)
         with Bar(f"filming {recording.labels[0]}") as bar:
-            other = None if beside is None else (beside if beside == WITNESS else label_suffix(beside)[1:], ghost)
-            film(recording, source.robot, source.scales, file, beside=other, progress=bar.move_to, **look)
+            film(shot, source.robot, out=file, progress=bar.move_to, **look)
     return files
 
 

@@ -32,16 +32,12 @@ _LOT = 32  # terrains crossed side by side on a GPU
 class CrossingRequest:
     """A controller's crossings of one terrain. Requests are equal if their crossings are."""
 
-    label: str = field(compare=False)
-    """Of the terrain."""
-    terrain: Terrains = field(compare=False)
-    """One row."""
+    label: str = field(compare=False)  # of the terrain
+    terrain: Terrains = field(compare=False)  # one row
     policy: str
     replicas: int = 20
-    seed: int = field(default=0, compare=False)
-    """What the terrain's seed was drawn with, for the record."""
-    terrain_key: str = field(init=False)
-    """Hash of the terrain and its seed."""
+    seed: int = field(default=0, compare=False)  # what the terrain's seed was drawn with, for the record
+    terrain_key: str = field(init=False)  # hash of the terrain and its seed
 
     def __post_init__(self) -> None:
         (digest,) = self.terrain.digests()
@@ -65,10 +61,7 @@ def request_elite(
     seed: int = 0,
     **crossing: Any,
 ) -> CrossingRequest:
-    """The crossings of an elite that ``faultline replay`` shows, by a ``policy`` in ``replicas`` episodes.
-
-    ``minimal`` are genes to cross in place of the elite's, from the same starts.
-    """
+    """The crossings of an elite that ``faultline replay`` shows, or of ``minimal`` genes from the same starts."""
     genes = archive.genes[number] if minimal is None else minimal
     seeds = episode_seeds(seed, number, 1, stream=Stream.RECORDED_ELITE)
     terrain = Terrains(genes=genes[None], seeds=seeds, space=archive.terrain_space)

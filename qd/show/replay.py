@@ -44,12 +44,9 @@ class ReplayTerrain:
     """A terrain to cross, and what is written about it."""
 
     request: CrossingRequest
-    stem: str
-    """Name of its files, without their ending."""
-    about: dict[str, Any]
-    """Facts for the file of its numbers."""
-    elite: EliteTerrain | None = None
-    """None of a map."""
+    stem: str  # name of its files, without their ending
+    about: dict[str, Any]  # facts for the file of its numbers
+    elite: EliteTerrain | None = None  # None of a map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,17 +54,12 @@ class ReplaySource:
     """Terrains to cross, and the controller that crosses them."""
 
     robot: RobotCfg
-    fitness: FitnessCfg
-    """Penalties, and the scales that make them comparable."""
-    folder: Path
-    """Default folder of files about the terrains."""
+    fitness: FitnessCfg  # penalties, and the scales that make them comparable
+    folder: Path  # default folder of files about the terrains
     terrains: Sequence[ReplayTerrain]
-    inputs: tuple[Path, ...] = ()
-    """Files of the user, which are never overwritten."""
-    by: str = ""
-    """Name of the controller, where it is not the usual one."""
-    opened_run: OpenedRun | None = None
-    """The run of elites."""
+    inputs: tuple[Path, ...] = ()  # files of the user, which are never overwritten
+    by: str = ""  # name of the controller, where it is not the usual one
+    opened_run: OpenedRun | None = None  # the run of elites
 
     @property
     def scales(self) -> dict[str, float]:
@@ -76,8 +68,7 @@ class ReplaySource:
 
     def requests(self, policy: str | None = None) -> list[CrossingRequest]:
         """The crossings of each terrain, by another controller if one is named."""
-        requests = [terrain.request for terrain in self.terrains]
-        return requests if policy is None else [replace(request, policy=policy) for request in requests]
+        return [replace(each.request, policy=policy or each.request.policy) for each in self.terrains]
 
     def steered_requests(self) -> list[CrossingRequest]:
         """The crossings of each elite by its witness, the controller that crosses it where it is steered."""
@@ -120,13 +111,9 @@ class ReplaySource:
 def source_from_run(
     opened_run: OpenedRun, elite: str = "", minimal: str | None = None, *, policy: str | None = None, **crossing: Any
 ) -> ReplaySource:
-    """Elites of a run or their minimal terrains, as :meth:`qd.show.elites.OpenedRun.terrains` takes them.
-
-    ``crossing`` may have ``replicas`` and ``seed``.
-    """
-    controller = opened_run.policy(policy)
-    crossing["policy"] = controller
-    suffix = opened_run.suffix(controller)
+    """Elites of a run or their minimal terrains; ``crossing`` may have ``replicas`` and ``seed``."""
+    crossing["policy"] = opened_run.policy(policy)
+    suffix = opened_run.suffix(crossing["policy"])
 
     def describe_terrain(elite: EliteTerrain) -> ReplayTerrain:
         genes = elite.genes if elite.minimal else None
@@ -207,78 +194,69 @@ def compute_numbers(recording: Recording) -> dict[str, Any]:
     """Rates with 95 % intervals (Wilson), outcomes and raw penalties of the valid episodes on one terrain."""
     outcome = recording.outcome[0]
     valid = outcome != Outcome.INVALID
+    result = recording.result()
     rates = count_rates(recording)
     goal, count = rates["goal_rate"]
     counts = {end: int((outcome == end).sum()) for end in Outcome if end}
-    outcomes = {end.name.lower(): count for end, count in counts.items() if count or end < Outcome.TILT}
     hits = {"success": count - rates["collision_rate"].hits, "goal": goal, "fallen": rates["fallen_rate"].hits}
     return {
         "episodes": recording.num_episodes,
         "invalid_episodes": recording.num_episodes - count,
-        "invalid_reasons": invalid_reasons(recording.result()),
+        "invalid_reasons": invalid_reasons(result),
         "rates": {
             name: {"rate": number / count, "hits": number, "interval": list(wilson_interval(number, count))}
             for name, number in hits.items()
         },
-        "outcomes": outcomes,
+        "outcomes": {end.name.lower(): count for end, count in counts.items() if count or end < Outcome.TILT},
         "duration_s": float(recording.duration_s[0, valid].mean()),
         "penalties": {
             name: {"mean": float(column.mean()), "std": float(column.std()), "unit": PENALTIES[name].unit}
-            for name, column in zip(recording.penalty_names, recording.result().penalties[0, valid].T, strict=True)
+            for name, column in zip(recording.penalty_names, result.penalties[0, valid].T, strict=True)
         },
     }
 
 
 def describe(source: ReplaySource, terrain: ReplayTerrain, recording: Recording) -> str:
     """How robots crossed a terrain and what it cost them; an elite's numbers as found and as corrected beside."""
-    run = source.opened_run
-    elite = terrain.elite
+    run, elite = source.opened_run, terrain.elite
     cells = Cells(len(source.fitness.penalties)) if run is None else run.archive.cells
     now = evaluate_rollout(recording.result(), cells, source.fitness)
-    columns: list[tuple[str, Evaluation, int]] = []
+    kinds = [PENALTIES[name] for name in source.fitness.penalties]
+    rates = rate_labels(asked_of(recording.ground))
+    labels = ["", "episodes", *rates.values(), *(kind.label for kind in kinds), *["fitness"] * (run is not None)]
+    columns: list[list[str]] = []
+
+    def add_column(label: str, values: Evaluation, row: int) -> None:
+        count = int(values.counted[row]) if values.valid[row] else 0
+        hits = [round(getattr(values, rate)[row] * count) if count else 0 for rate in rates]
+        texts = [format_rate(hit, count, short=True).replace("% to ", "-").replace(" to ", "-") for hit in hits]
+        means, stds = (source.fitness.scales * each[row] for each in (values.penalty_mean, values.penalty_std))
+        for mean, std, ratio in zip(means, stds, values.ratios[row], strict=True):
+            digits = 2 if max(mean, std) < 100 else 0
+            texts.append(f"{mean:.{digits}f}±{std:.{digits}f}, {ratio:.0%}")
+        texts += [f"{values.fitness[row]:.2f}"] * (run is not None)
+        columns.append([label, str(values.episodes[row]), *texts])
+
     about: dict[str, Any] = {}
     if run is not None and elite is not None:
-        archive = run.archive
-        number = elite.number
-        whole = "whole, " if elite.minimal else ""
-        stored = {"as found": archive, "fresh": archive.fresh}
-        columns = [(f"{whole}{label}", values, number) for label, values in stored.items() if values is not None]
+        archive, number = run.archive, elite.number
+        for label, values in {"as found": archive, "fresh": archive.fresh}.items():
+            if values is not None:
+                add_column("whole, " * bool(elite.minimal) + label, values, number)
         about["parts"] = elite.minimal["words"] if elite.minimal else run.space.describe(elite.genes).splitlines()
         about["same_cell"] = now.valid[0] and cells.are_neighbours(archive.cell[number : number + 1], now.cell)[0]
         about["likelihood"] = run.log_likelihood(elite.genes)
         about["verdicts"] = describe_judgement(archive, number)
-    columns.append(("now", now, 0))
+    add_column("now", now, 0)
     reasons = invalid_reasons(recording.result())
-    units = [f"{PENALTIES[name].label} [{PENALTIES[name].unit}]" for name in source.fitness.penalties]
-    about |= {"units": ", ".join(units), "invalid": sum(reasons.values()), "reasons": format_reasons(reasons)}
+    about |= {"units": ", ".join(f"{kind.label} [{kind.unit}]" for kind in kinds)}
+    about |= {"invalid": sum(reasons.values()), "reasons": format_reasons(reasons)}
     lines = _TEMPLATES.get_template("replay.txt").render(run=run, elite=elite, controller=source.by, **about)
     indent: Any = {"initial_indent": "  ", "subsequent_indent": "    ", "break_on_hyphens": False}
     text = [textwrap.fill(line, 80, **indent) for line in lines.splitlines()]
-    numbers = _format_numbers(columns, source.fitness, rate_labels(asked_of(recording.ground)))
+    left, width = max(map(len, labels)), max(len(cell) for column in columns for cell in column)
+    numbers = [
+        f"{label:{left}}" + "".join(f"  {cell:>{width}}" for cell in cells)
+        for label, *cells in zip(labels, *columns, strict=True)
+    ]
     return "\n".join([make_title(recording, source.by), *numbers, *text])
-
-
-def _format_numbers(
-    columns: Sequence[tuple[str, Evaluation, int]], fitness: FitnessCfg, labels: dict[str, str]
-) -> list[str]:
-    """A row a number, rates by their labels, and a column an evaluation, of which one elite is shown."""
-    rows = {"": [label for label, _, _ in columns]}
-    rows["episodes"] = [str(values.episodes[n]) for _, values, n in columns]
-    for rate, label in labels.items():
-        texts = rows[label] = []
-        for _, values, n in columns:
-            count = int(values.counted[n]) if values.valid[n] else 0
-            hits = round(getattr(values, rate)[n] * count) if count else 0
-            texts.append(format_rate(hits, count, short=True).replace("% to ", "-").replace(" to ", "-"))
-    for p, (name, scale) in enumerate(zip(fitness.penalties, fitness.scales, strict=True)):
-        texts = rows[PENALTIES[name].label] = []
-        for _, values, n in columns:
-            mean = scale * values.penalty_mean[n, p]
-            std = scale * values.penalty_std[n, p]
-            digits = 2 if max(mean, std) < 100 else 0
-            texts.append(f"{mean:.{digits}f}±{std:.{digits}f}, {values.ratios[n, p]:.0%}")
-    if len(columns) > 1:
-        rows["fitness"] = [f"{values.fitness[n]:.2f}" for _, values, n in columns]
-    label_width = max(map(len, rows))
-    width = max(len(text) for row in rows.values() for text in row)
-    return [f"{label:{label_width}}" + "".join(f"  {text:>{width}}" for text in row) for label, row in rows.items()]

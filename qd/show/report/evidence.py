@@ -49,13 +49,8 @@ def read_numbers(file: Path) -> tuple[str, dict[str, Any]]:
         raise FileNotFoundError(f"no file at {file}: give one that a gate, dose, rates, pack or search wrote")
     content = read_json(file)
     kinds = [kind for kind, (key, _) in _KINDS.items() if key in content]
-    needed = {
-        "robot",
-        "robot_sha256",
-        "sources_sha256",
-        "dirty",
-        "controllers" if kinds == ["dose"] else "policy_sha256",
-    }
+    needed = {"robot", "robot_sha256", "sources_sha256", "dirty"}
+    needed.add("controllers" if kinds == ["dose"] else "policy_sha256")
     if not kinds or not needed <= {*content} or "\n" in str(file):
         rule = "must be written by a gate, dose, rates, pack or search"
         raise ValueError(f"{file} {rule}, got another file: leave it out")
@@ -77,15 +72,15 @@ def dose_limits(content: Mapping[str, Any], controller: str, speed: float) -> li
     for element, title in content["titles"].items():
         rows = [row for row in content["dose"] if row["element"] == element and row["controller"] == controller]
         safe = [row["interval"] is not None and row["interval"][0] >= SAFE_RATE for row in rows]
-        count = safe.index(False) if False in safe else len(rows)
+        count = [*safe, False].index(False)
         unit = f" {rows[0]['unit']}" if rows[0]["unit"] else ""
+        text = f"not at {rows[0]['value']:g}{unit}, the first that was tried"
         if count:
-            rate = format_value(rows[count - 1]["goal_rate"], rows[count - 1]["interval"])
-            last = ", the last that was tried" if count == len(rows) else ""
+            last = rows[count - 1]
+            tried = ", the last that was tried" * (count == len(rows))
             way = "down" if rows[0]["value"] > rows[-1]["value"] else "up"
-            text = f"{way} to {rows[count - 1]['value']:g}{unit}{last}: {rate} reach the goal, at {speed:g} m/s"
-        else:
-            text = f"not at {rows[0]['value']:g}{unit}, the first that was tried"
+            rate = format_value(last["goal_rate"], last["interval"])
+            text = f"{way} to {last['value']:g}{unit}{tried}: {rate} reach the goal, at {speed:g} m/s"
         limits.append((f"{title}, {rows[0]['parameter']}", text))
     return limits
 
@@ -144,17 +139,12 @@ def write_evidence(
 ) -> Path:
     """Writes the page, its numbers beside it as .json and the hashes of both and of all files as .sha256.
 
-    Args:
-        files: Files of numbers about one controller.
-        robot: The robot, if it is not shipped.
-        controller: Its name in files of doses; their first if None.
-        out: The page, *.html; evidence.html beside the first file if None.
+    ``robot`` is needed if it is not shipped. ``controller`` is its name in files of doses; their first if None. ``out``
+    is the page, evidence.html beside the first file if None.
     """
     contents = [read_numbers(file) for file in files]
     tested = [resolve_robot(content, robot, file, "file") for file, (_, content) in zip(files, contents, strict=True)]
-    about = [
-        (content["robot_sha256"], tested_hash(*numbers, controller)) for numbers in contents for content in numbers[1:]
-    ]
+    about = [(content["robot_sha256"], tested_hash(kind, content, controller)) for kind, content in contents]
     if len({*about}) != 1 or about[0][1] is None:
         listed = ", ".join(f"{file} of {str(digest)[:12]}" for file, (_, digest) in zip(files, about, strict=True))
         rule = "evidence must be about one controller of one robot, known by its file's hash"
@@ -167,17 +157,13 @@ def write_evidence(
     for file in written:
         prepare_output(file)
     names = [os.path.relpath(file, out.parent) for file in files]
-    hashes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    hashes = [*map(_hash_file, files)]
     parts = []
     for (kind, content), name, digest in zip(contents, names, hashes, strict=True):
         label = controller or (next(iter(content["controllers"])) if kind == "dose" else "")
         title, table = tabulate(content, kind, label, tested[0].speed)
-        origin = [
-            ("file", name),
-            ("sha256", digest),
-            *origin_rows(content),
-            ("sources_sha256", content["sources_sha256"]),
-        ]
+        origin = [("file", name), ("sha256", digest), *origin_rows(content)]
+        origin += [("sources_sha256", content["sources_sha256"])]
         origin += [("changed", "sources differed from the commit")] if content["dirty"] else []
         origin += [("gate_sha256", content["gate_sha256"]), ("error", content["error"])] if kind == "gate" else []
         origin += [("terrains_sha256", check["terrains_sha256"]) for check in content.get("checks", ())]
@@ -189,11 +175,14 @@ def write_evidence(
     }  # fmt: skip
     publish_page(out, "evidence.html", **evidence)
     write_atomically(out.with_suffix(".json"), to_json(evidence))
-    own = [out.name, out.with_suffix(".json").name]
-    sums = [(hashlib.sha256((out.parent / name).read_bytes()).hexdigest(), name) for name in own]
+    sums = [(_hash_file(file), file.name) for file in written[:2]]
     lines = [f"{digest}  {name}\n" for digest, name in [*sums, *zip(hashes, names, strict=True)]]
     write_atomically(out.with_suffix(".sha256"), "".join(lines).encode())
     return out
+
+
+def _hash_file(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def verify_evidence(file: Path) -> int:
@@ -202,16 +191,13 @@ def verify_evidence(file: Path) -> int:
     rows = [match.groups() for line in lines if (match := re.fullmatch(r"([0-9a-fA-F]{64}) [ *](.+)", line))]
     own = {file.with_suffix(suffix).name for suffix in (".html", ".json")}
     if not rows or len(rows) < len(lines) or not own <= {name for _, name in rows}:
-        raise ValueError(
-            f"{file} must be a list of SHA-256, as `faultline report --evidence` writes it: give that file"
-        )
-    wrong = []
-    for digest, name in rows:
-        path = file.parent / name
-        if not path.is_file():
-            wrong.append(f"{name} is gone")
-        elif hashlib.sha256(path.read_bytes()).hexdigest() != digest.lower():
-            wrong.append(f"{name} was changed")
+        rule = "must be a list of SHA-256, as `faultline report --evidence` writes it"
+        raise ValueError(f"{file} {rule}: give that file")
+    wrong = [
+        f"{name} {'was changed' if path.is_file() else 'is gone'}"
+        for digest, name in rows
+        if not (path := file.parent / name).is_file() or _hash_file(path) != digest.lower()
+    ]
     if wrong:
         raise ValueError(f"{file} does not hold: {', '.join(wrong)}: make the evidence anew, or put copies back")
     return len(rows)

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jinja2 import Environment
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
+from qd.evaluate.labels import FATES, MEASURES, SETS
 from qd.search.progress import clock
 from qd.show.crossed import find_failure_time, find_ghost_episode, find_typical_episode
 from qd.show.figures import relief
@@ -19,6 +21,7 @@ from qd.show.film import clear_elevation
 from qd.show.replay import save
 from sim.files.atomic import prepare_output
 from sim.files.figures import as_image
+from sim.files.intervals import format_value
 from sim.files.templates import open_templates
 from sim.recording.recorder import Recording
 from sim.recording.renderer import Camera, Renderer
@@ -26,8 +29,7 @@ from sim.robots.robot import RobotCfg
 from sim.terrains.bank import make_heights, make_terrains
 from sim.terrains.spaces.base import TerrainSpace
 
-TILE = (96, 48)
-"""Width and height of a small picture [pixels]."""
+TILE = (96, 48)  # width and height of a small picture [pixels]
 _LOT = 50  # terrains that are drawn together
 _EVERY = 2  # every other node is enough for a small picture
 _SIZE = (960, 600)  # of a close picture [pixels], which a page shows at half of that
@@ -70,11 +72,17 @@ def check_page(out: Path) -> None:
     prepare_output(out)
 
 
+def open_pages() -> Environment:
+    """The templates of pages, with what they need to write numbers and names."""
+    pages = open_templates(Path(__file__).parent / "templates")
+    pages.filters |= {"percent": percent, "counted": counted, "clock": clock, "with_limits": format_value}
+    pages.globals |= {"sets": SETS, "measures": MEASURES, "fates": FATES}
+    return pages
+
+
 def publish_page(out: Path, template: str, **content: object) -> Path:
     """Writes a page from its template, atomically."""
-    environment = open_templates(Path(__file__).parent / "templates")
-    environment.filters |= {"percent": percent, "counted": counted, "clock": clock}
-    text = environment.get_template(template).render(content)
+    text = open_pages().get_template(template).render(content)
     save(out, text.encode(errors="backslashreplace"), "Report")  # a file's name may hold bytes that are no text
     return out
 
@@ -89,10 +97,7 @@ def origin_rows(origin: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def draw_sheet(genes: NDArray[np.float32], space: TerrainSpace) -> dict[str, Any]:
-    """Terrains of genes, shape (T, num_genes), at least one, from above in one image, so that large pages are light.
-
-    ``source`` is the image; ``offsets`` are pixels from its left and top to each terrain. Blue is low, brown high.
-    """
+    """At least one terrain, genes (T, num_genes), from above in one image; ``offsets`` are pixels from left and top."""
     columns = math.ceil(math.sqrt(len(genes) / 2))  # about a square, as a tile is twice as wide as high
     image = Image.new("RGB", (columns * TILE[0], -(-len(genes) // columns) * TILE[1]))
     offsets = [(k % columns * TILE[0], k // columns * TILE[1]) for k in range(len(genes))]

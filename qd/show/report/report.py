@@ -1,4 +1,4 @@
-"""One page about a run: what is known of it, and robots that cross its worst terrains for the page."""
+"""One page about a search, with robots that cross its worst terrains for it, or about the rounds of a hardening."""
 
 from pathlib import Path
 from typing import Any
@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Outcome
-from qd.evaluate.tables import read_tables
+from qd.evaluate.tables import as_tables, read_tables
 from qd.faults.causes import describe_cause
 from qd.faults.families import VERDICTS, Ranking, summarise_search
-from qd.faults.numbers import MinimalTerrains, describe_witness, fault_numbers, further_rates
+from qd.faults.numbers import describe_witness, fault_numbers, further_rates
 from qd.search.directory import METRICS_FILE, ROUNDS_FILE, RunDirectory, output_folder
 from qd.search.progress import Bar
 from qd.show.crossed import Rate, count_rates, draw_crossing, draw_time_line
@@ -18,14 +18,16 @@ from qd.show.elites import OpenedRun, open_run
 from qd.show.figures import draw_archive, draw_curves
 from qd.show.recordings import Recordings, request_elite
 from qd.show.report import page
-from qd.show.report.evaluation import compare_controllers, write_rounds
 from qd.workers.compute import check_policy, choose_device
 from sim.controllers.spec import SHIPPED, ControllerSpec, resolve_policy
+from sim.files.atomic import read_json
+from sim.files.command import command_line
 from sim.files.intervals import RATES, bootstrap_interval
 from sim.files.provenance import without_machine
 from sim.rates import SUCCESS, rate_labels
 from sim.recording.recorder import Recording
 from sim.recording.renderer import open_context
+from sim.robots.find import get_robot
 
 _OTHER_CAUSES = 3  # beside those of the first pictures; one terrain of each is shown
 _MAX_BARS = 10
@@ -63,8 +65,10 @@ def write_report(
     device = choose_device(device)
     compared = None
     if tables is not None:
-        file = without_machine(str(tables))
-        compared = compare_controllers(read_tables(tables, opened_run.robot), file=file, searched=archive.policy_sha256)
+        content = read_tables(tables, opened_run.robot)
+        hashes = {about["sha256"] for about in content["controllers"].values()}
+        of_searched = archive.policy_sha256 is None or archive.policy_sha256 in hashes
+        compared = {"file": without_machine(str(tables)), "tables": content, "of_searched": of_searched}
     content = collect_content(opened_run, ranking, controller, is_searched=not suffix)
     heads, others = _choose_elites(ranking, num_elites)
     cases: dict[int, dict[str, Any]] = {}
@@ -91,45 +95,40 @@ def write_report(
 def _choose_elites(ranking: Ranking, num_elites: int) -> tuple[list[int], list[int]]:
     """The worst elites, failing ones if there are any, and the worst of some other causes."""
     rows = ranking.order()[:num_elites]
-    failing = rows[ranking.failing[rows]]
-    rows = failing if len(failing) else rows
+    rows = rows[ranking.failing[rows] | ~ranking.failing[rows].any()]
     causes = {ranking.causes[row] for row in rows}
     others = [members[0] for cause, members in ranking.by_cause().items() if cause not in causes][:_OTHER_CAUSES]
-    numbers = ranking.numbers
-    return numbers[rows].tolist(), [int(numbers[row]) for row in others]
+    return ranking.numbers[rows].tolist(), [int(ranking.numbers[row]) for row in others]
 
 
 def cross_cases(
     run: OpenedRun, ranking: Ranking, policy: str, heads: list[int], others: list[int], device: str, *, pictured: bool
 ) -> dict[int, dict[str, Any]]:
-    """Lets a controller cross elites and takes their pictures, by number; one without a valid episode is left out.
-
-    ``heads`` are crossed by their best certifier too, if they have one; ``others`` are shown in short.
-    """
-    archive = run.archive
+    """Lets a controller, and of ``heads`` the best certifier, cross elites; pictures of valid ones by number."""
     files = run.certifiers()
     certifiers = {number: name for number in heads if (name := run.certifier(number)) is not None}
     crossings = [(number, policy) for number in (*heads, *others)]
     crossings += [(number, files[name]) for number, name in certifiers.items()]
-    requests = [request_elite(archive, number, policy=controller) for number, controller in crossings]
+    requests = [request_elite(run.archive, number, policy=controller) for number, controller in crossings]
     recorded = dict(zip(crossings, Recordings(run.robot, device=device).record(requests), strict=True))
     cases = {}
     with Bar("drawing", len(heads) + len(others)) as bar:
         for done, number in enumerate((*heads, *others), 1):
-            recording = recorded[number, policy]
+            recording, name = recorded[number, policy], certifiers.get(number)
             if (recording.outcome[0] != Outcome.INVALID).any():
-                name = certifiers.get(number)
                 ghost = None if name is None else (name, recorded[number, files[name]])
                 cases[number] = case = _make_case(run, ranking, number, recording, ghost, pictured)
                 if number in heads:
-                    title = f"{archive.robot}, elite {number} of {len(archive):,}: {case['rate'].count} episodes"
+                    title = (
+                        f"{run.archive.robot}, elite {number} of {len(run.archive):,}: {case['rate'].count} episodes"
+                    )
                     case["figure"] = page.encode_picture(draw_crossing(recording, title))
             bar.move_to(done)
     return cases
 
 
 def _make_case(
-    opened_run: OpenedRun,
+    run: OpenedRun,
     ranking: Ranking,
     number: int,
     recording: Recording,
@@ -137,43 +136,37 @@ def _make_case(
     pictured: bool,
 ) -> dict[str, Any]:
     """What the template takes of an elite; ``source`` is a picture at ``time_s`` [s], empty without pictures."""
-    moments = page.choose_moments(recording, ghost and ghost[1], opened_run.scales)
-    sources = page.render_close_pictures(opened_run.robot, moments) if pictured else [""] * len(moments)
-    beside = None
-    if ghost is not None:
-        rate = count_rates(ghost[1])["goal_rate"]
-        beside = {"name": ghost[0], "source": sources[1], "time_s": moments[1][2], "rate": rate}
-    row = ranking.find_row(number)
+    moments = page.choose_moments(recording, ghost and ghost[1], run.scales)
+    sources = page.render_close_pictures(run.robot, moments) if pictured else [""] * len(moments)
+    shown = [{"source": source, "time_s": time_s} for source, (*_, time_s) in zip(sources, moments, strict=True)]
+    row, genes, limit_s = ranking.find_row(number), run.archive.genes[number], run.robot.max_duration_s
     rate = count_rates(recording)["goal_rate"]
     tries = "fresh tries" if ranking.is_fresh[row] else "tries of the search"
     rates = {"for this page": rate, tries: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row]))}
-    rates |= {label: Rate(*counts) for label, counts in further_rates(opened_run.archive, number).items()}
+    rates |= {label: Rate(*counts) for label, counts in further_rates(run.archive, number).items()}
     rows = [[label, f"{rate.hits} of {rate.count}", rate.limits] for label, rate in rates.items()]
-    acting = opened_run.space.time_line(opened_run.archive.genes[number], opened_run.robot.max_duration_s)
-    in_time = any((first, last) != (0.0, opened_run.robot.max_duration_s) for _, first, last in acting)
+    acting = run.space.time_line(genes, limit_s)
+    in_time = any((first, last) != (0.0, limit_s) for _, first, last in acting)
     return {
+        **shown[0],
         "number": number,
         "name": ranking.name(row),
         "verdict": VERDICTS[int(ranking.verdict[row])],
-        "source": sources[0],
-        "time_s": moments[0][2],
-        "conditions": opened_run.space.condition_text(opened_run.archive.genes[number]),
-        "beside": beside,
-        "witness": describe_witness(opened_run.archive, number),
+        "conditions": run.space.condition_text(genes),
+        "beside": ghost and {**shown[1], "name": ghost[0], "rate": count_rates(ghost[1])["goal_rate"]},
+        "witness": describe_witness(run.archive, number),
         "time_line": page.encode_picture(draw_time_line(acting, recording)) if in_time else "",
         "figure": "",
         "rate": rate,
-        "rates": page.Table(head=[SUCCESS[opened_run.space.asks], "", "95 % interval"], rows=rows),
+        "rates": page.Table(head=[SUCCESS[run.space.asks], "", "95 % interval"], rows=rows),
     }
 
 
 def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_searched: bool) -> dict[str, Any]:
     """Values of the template, without the terrains that a controller crossed for the page."""
-    archive = opened_run.archive
-    minima = opened_run.minima
+    archive, minima, space = opened_run.archive, opened_run.minima, opened_run.space
     search = opened_run.search()
     run = RunDirectory(opened_run.folder)
-    space = opened_run.space
     searched, _ = opened_run.as_searched()
     labels = rate_labels(space.asks)
     file = run.path / METRICS_FILE  # a run that goes on meanwhile may have some rows more
@@ -195,16 +188,18 @@ def collect_content(opened_run: OpenedRun, ranking: Ranking, policy: str, *, is_
         "crosser": "" if is_searched else ControllerSpec.parse(policy).label,
         "place": without_machine(str(opened_run.path)),
         "summary": summarise_search(ranking, archive),
-        "failing": int(ranking.failing.sum()),
-        "certifiers": " or ".join(archive.certifiers + ("a robot that is steered",) * (archive.witnesses is not None)),
         "numbers": fault_numbers(archive),
         "fault_families": len(np.unique(ranking.families[ranking.verdict == _FAULT])),
         "means": {label: format_mean(getattr(ranking, rate), ranking.families) for rate, label in labels.items()},
         "causes": count_causes(ranking),
         "tiles": page.draw_sheet(archive.genes[ranking.numbers], space),
-        "elites": _list_elites(ranking),
+        "ranking": ranking,
+        "verdicts": VERDICTS,
+        "rates": labels,
+        "limits": lambda row: Rate(ranking.hits("goal_rate", row), int(ranking.counted[row])).limits,
         "minimal_tiles": None if minima is None else page.draw_sheet(np.array([*minima.genes.values()]), space),
-        "minimal": None if minima is None else _list_minima(minima),
+        "minimal": None if minima is None else minima.numbers["elites"],
+        "describe_cause": describe_cause,
         "curves": page.encode_picture(draw_curves(archive, metrics)) if metrics else "",
         "parallel": page.encode_picture(draw_archive(archive)),
         "origin": page.origin_rows({} if search is None else run.read_config()),
@@ -219,10 +214,7 @@ def format_mean(rates: NDArray[np.float64], families: NDArray[np.int64]) -> str:
 
 
 def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
-    """The bars, the longest first; the rarest causes share one.
-
-    Each has a name, its failing elites and faults, percent of the longest bar an elite, and the row of its worst elite.
-    """
+    """The bars, the longest first; the rarest causes share one. ``tile`` is the row of the worst elite."""
     groups = ranking.by_cause()
     tiles = {cause: int(rows[0]) for cause, rows in groups.items()}
     if len(groups) > _MAX_BARS:
@@ -241,36 +233,29 @@ def count_causes(ranking: Ranking) -> list[dict[str, Any]]:
     ]
 
 
-def _list_elites(ranking: Ranking) -> dict[str, Any]:
-    """Every elite, faults first, then what fails most: rows of pictures with cells, and columns not for a phone."""
-    labels = rate_labels(ranking.asks)
-    rows = {
-        row: {
-            "elite": f"{ranking.numbers[row]}",
-            "what happens": ranking.name(row),
-            "verdict": VERDICTS[int(ranking.verdict[row])],
-            **{f"{label} [%]": f"{100 * getattr(ranking, rate)[row]:.0f}" for rate, label in labels.items()},
-            "95 % interval": Rate(ranking.hits("goal_rate", row), int(ranking.counted[row])).limits,
-            "family": f"{ranking.families[row]}",
-            "fitness": f"{ranking.fitness[row]:.1f}",
-        }
-        | ({} if (known := ranking.log_likelihood) is None else {"log-likelihood of conditions": f"{known[row]:.1f}"})
-        for row in ranking.by_severity().tolist()
-    }
-    return {"rows": [*rows.items()], "wide": (5, 6, 7, 8, 9, 10, 11)}
+def write_rounds(run: Path, robot: str | None, out: Path | None) -> Path:
+    """Writes the page about the rounds of a hardening; returns its file."""
+    content = _read_rounds(run, robot)
+    out = out or run / "report.html"
+    page.check_page(out)
+    content |= {"run": without_machine(str(run)), "origin": page.origin_rows(content)}
+    content["report_command"] = lambda search: command_line("report", robot=robot, run=run / search)
+    return page.publish_page(out, "rounds.html", **{"choices": {}, **content})
 
 
-def _list_minima(minima: MinimalTerrains) -> dict[str, Any]:
-    rows = [
-        {
-            "elite": f"{entry['elite']}",
-            "cause": describe_cause(entry["cause"]),
-            "parts left": f"{len(entry['bumps'])} of {entry['of']}",
-            "passed [%]": "-" if entry["goal_rate"] is None else f"{100 * entry['goal_rate']:.0f}",
-            "95 % interval": "{:.0f} to {:.0f} %".format(*(100 * limit for limit in entry["goal_interval"])),
-            "margin [cm]": "-" if entry["margin_m"] is None else f"{100 * entry['margin_m']:.1f}",
-            "verdict": str(entry.get("verdict", "")),
-        }
-        for entry in minima.numbers["elites"]
-    ]
-    return {"rows": [*enumerate(rows)], "wide": (3, 5, 6)}
+def _read_rounds(run: Path, robot: str | None) -> dict[str, Any]:
+    file = run / ROUNDS_FILE
+    content = read_json(file)
+    if not content.get("rounds"):
+        raise ValueError(f"{file} must have a search that is over, got none: let the hardening go on")
+    try:
+        content["tables"] = as_tables({"robot": content["robot"], **content["tables"]})
+        if not all({"controller", "search", "certifiers", "faults"} <= set(row) for row in content["rounds"]):
+            raise ValueError("a round lacks a name")
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} must be of `faultline harden`, got another or a damaged file: {error}") from None
+    if robot is not None and get_robot(robot).name != content["robot"]:
+        raise ValueError(f"{file} is of robot {content['robot']}, got --robot {robot}: give that robot or another run")
+    for row in content["rounds"]:  # without a specialist faults are by the panel
+        row["faults"] = row.get("faults_panel") if row["faults"] is None else row["faults"]
+    return content

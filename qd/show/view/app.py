@@ -13,7 +13,7 @@ import viser
 from qd.show.recordings import Recordings
 from qd.show.view.panels import PlayerBar, Selection
 from qd.show.view.recorder import Recorder, TaskProgress
-from qd.show.view.scene import SKY, compute_first_view, robot_shapes
+from qd.show.view.scene import SKY, compute_view, robot_shapes
 from qd.show.view.tab import Shared, Tab
 from qd.show.view.viewed import ViewedRun
 from sim.files.atomic import prepare_output
@@ -39,7 +39,7 @@ class App:
     def __init__(self, show: ViewedRun, recordings: Recordings, recorder: Recorder, *, host: str, port: int) -> None:
         self.tabs: dict[int, Tab] = {}
         self.bars: dict[int, PlayerBar] = {}
-        self._tasks = queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]]]()
+        self._tasks = queue.SimpleQueue[Callable[[], None]]()
         recorder.robot = show.robot
         recorder.report = partial(self.post, self.show_progress)
         request = show.request(Selection(show).picked, next(iter(show.controllers), None), minimal=show.minimal)
@@ -52,7 +52,7 @@ class App:
         self.page.scene.set_up_direction("+z")
         self.page.scene.configure_default_lights(enabled=True, cast_shadow=True)
         self.page.scene.set_background_image(SKY)
-        self.page.initial_camera.position, self.page.initial_camera.look_at = compute_first_view(*_WINDOW)
+        self.page.initial_camera.position, self.page.initial_camera.look_at = compute_view("near", *_WINDOW)
         self.page.on_client_connect(self._connect)  # viser calls it in a thread
         self.page.on_client_disconnect(lambda client: self.post(self.leave, client.client_id))
 
@@ -61,7 +61,7 @@ class App:
 
     def post(self, act: Callable[..., None], *args: Any) -> None:
         """Have the loop call ``act(*args)``; from any thread."""
-        self._tasks.put((act, args))
+        self._tasks.put(partial(act, *args))
 
     def act(self, client: viser.ClientHandle, name: str, value: Any) -> None:
         """Do an action of a visitor; the first one brings the address and the size of the window."""
@@ -95,10 +95,9 @@ class App:
         last = time.perf_counter()
         while True:
             self.do_tasks(wait_s=_FRAME_S if self._playing else _IDLE_S)
-            now = time.perf_counter()
+            before, last = last, time.perf_counter()
             for tab in self.tabs.values():
-                tab.tick(now - last)
-            last = now
+                tab.tick(last - before)
 
     @property
     def _playing(self) -> bool:
@@ -109,10 +108,10 @@ class App:
         deadline = time.perf_counter() + wait_s
         while (remaining_s := deadline - time.perf_counter()) > 0.0:
             try:
-                act, args = self._tasks.get(timeout=remaining_s)
+                task = self._tasks.get(timeout=remaining_s)
             except queue.Empty:
                 return
-            act(*args)
+            task()
             if not self._playing and self._tasks.empty():
                 return
 

@@ -1,11 +1,8 @@
-"""The panels of a tab, the archive left and the crossing right, the bar below, a tab's selection, clock and address.
-
-A panel posts what a visitor does to the viewer's loop, which calls the :class:`qd.show.view.tab.Tab`.
-"""
+"""A tab's panels and bar, which post what a visitor does to the viewer's loop, and its selection, clock and address."""
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -24,8 +21,7 @@ from viser import _messages, uplot
 from kernels.penalties import PENALTIES
 from qd.faults.families import summarise_search
 from qd.show.crossed import all_endings
-from qd.show.view.playing import Crossing
-from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, compute_first_view
+from qd.show.view.scene import COMMAND_COLOR, FORCE_COLOR, PHONE, Crossing
 from qd.show.view.viewed import FITNESS_TEXT, TEMPLATES, Column, ViewedRun, render_rates
 from sim.rates import rate_labels
 from sim.recording.renderer import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH
@@ -35,8 +31,7 @@ _SCRIPT = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 _WIDTH = 360  # of a panel [pixels]
 _NARROW_WIDTH = 300
 _WIDE = 1300  # a narrower window has no room for two wide panels, and the archive is folded [pixels]
-TERRAINS = ("whole", "minimal")
-"""Terrains of an elite to choose from."""
+TERRAINS = ("whole", "minimal")  # of an elite, to choose from
 _CURVE_POINTS = 300
 _HOLD_S = 1.5  # real time from the end of a crossing that plays to its next begin
 _KEYS = """- **Space** play or pause
@@ -44,19 +39,21 @@ _KEYS = """- **Space** play or pause
 - **1** to **9** an episode
 - **N** **P** next or previous elite
 - **F** follow the robot, **O** overview"""
+_LEGEND = {
+    "slippery": SLIPPERY, "soft": SOFT, "touch": TOUCH, "foot": FOOT_TOUCH, "force": FORCE_COLOR,
+    "command": COMMAND_COLOR, "ghost": OTHER_CONTROLLER,
+}  # fmt: skip
 _NAMES = {"time_s": "t", "position": "initialCameraPosition", "look_at": "initialCameraLookAt"}
 
 
 class Selection:
-    """The listed elites in their order, and the picked one: at first all, and the one to show first."""
+    """Numbers of the listed elites in their order, ``matching``, and of the shown one, ``picked``, listed or not."""
 
     def __init__(self, show: ViewedRun) -> None:
         self._show = show
         self._choice: dict[str, str] = {}
         self.matching: NDArray[np.int64] = show.list_elites()
-        """Numbers of the elites of the list, in their order."""
         self.picked = int(self.matching[0]) if show.elite is None else show.elite
-        """Number of the elite that is shown; it stays when it is not listed any more."""
 
     def choose(self, **changes: str) -> None:
         """List the elites of another ``cause``, or in another ``order``, as :class:`ViewedRun` has them."""
@@ -64,10 +61,7 @@ class Selection:
         self.matching = self._show.list_elites(**self._choice)
 
     def step(self, by: int) -> int:
-        """Number of the next (1) or previous (-1) elite of the list; the picked one at the end of the list.
-
-        A picked elite that is not listed has the neighbours of its position among all elites.
-        """
+        """Number of the next (1) or previous (-1) listed elite by its position among all; the picked one at the end."""
         positions = np.argsort(self._show.list_elites(**self._choice | {"cause": ""}))  # of each elite
         ahead = positions[self.matching] - positions[self.picked]
         near = self.matching[ahead > 0][:1] if by > 0 else self.matching[ahead < 0][-1:]
@@ -79,11 +73,9 @@ class Clock:
     """Time within a crossing, run by real time; a crossing that plays begins again after its end."""
 
     duration_s: float = 0.0
-    begin_s: float = 0.0
-    """Where it begins again."""
+    begin_s: float = 0.0  # where it begins again
     time_s: float = 0.0
-    speed: float = 1.0
-    """Simulated seconds in a real one."""
+    speed: float = 1.0  # simulated seconds in a real one
     playing: bool = False
     _waited_s: float = 0.0
 
@@ -105,14 +97,11 @@ class Address(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, ren
     terrain: str | None = None
     controller: str | None = None
     ghost: str | None = None
-    episode: int | None = None
-    """Counted from 1."""
+    episode: int | None = None  # counted from 1
     time_s: float | None = None
     follow: bool = False
-    position: str | None = None
-    """Where the camera stands [m], ``x,y,z``; viser reads it too: its page begins there."""
+    position: str | None = None  # of the camera, x,y,z [m]; viser reads it too: its page begins there
     look_at: str | None = None
-    """What the camera looks at [m]."""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.time_s or 0.0):
@@ -155,9 +144,12 @@ class ArchivePanel:
             title = f"{show.robot.name} · {show.folder} · {len(show.archive):,} elites"
             gui.add_html(_small(f"{escape(title)}<br><b>{escape(summarise_search(show.ranking, show.archive))}.</b>"))
             orders = {label: name for name, label in show.ranking.orders.items()}
+            causes = show.causes()
             choose = partial(tab.shared.post, self._choose)
-            _add_choice(gui, "Cause", show.causes(), partial(choose, "cause"))
-            _add_choice(gui, "Sort", orders, partial(choose, "order"), f"Fitness is {FITNESS_TEXT}.")
+            _add_choice(gui, "Cause", causes, lambda label: choose("cause", causes[label]))
+            _add_choice(
+                gui, "Sort", orders, lambda label: choose("order", orders[label]), f"Fitness is {FITNESS_TEXT}."
+            )
             self.list = gui.add_html("")
             self._map = gui.add_html("")
 
@@ -185,13 +177,11 @@ class CrossingPanel:
             gui.main_panel.dock_right()
             gui.main_panel.set_width(_WIDTH if tab.window[0] >= _WIDE else _NARROW_WIDTH)
         self.head = gui.add_html("")
-        names = {name: name for name in controllers or ("none",)}
-        self.controller = _add_choice(gui, "Controller", names, partial(post, tab.choose_controller))
-        ghosts = {name: name for name in tab.ghost_choices}
-        self.ghost = _add_choice(gui, "Ghost", ghosts, partial(post, tab.choose_ghost))
+        self.controller = _add_choice(gui, "Controller", controllers or ("none",), partial(post, tab.choose_controller))
+        self.ghost = _add_choice(gui, "Ghost", tab.ghost_choices, partial(post, tab.choose_ghost))
         self.controller.disabled = self.ghost.disabled = not controllers
-        whole = {label: bool(k) for k, label in enumerate(TERRAINS)}
-        self.terrain = _add_choice(gui, "Terrain", whole, partial(post, tab.choose_terrain))
+        choose_terrain = partial(post, tab.choose_terrain)
+        self.terrain = _add_choice(gui, "Terrain", TERRAINS, lambda label: choose_terrain(label == TERRAINS[1]))
         self.rates = gui.add_html("")
         kinds = [PENALTIES[name] for name in tab.show.archive.penalties]
         series = [uplot.Series(label=kind.label, stroke=kind.color, width=2.0) for kind in kinds]
@@ -199,20 +189,18 @@ class CrossingPanel:
             look: Any = {"height": 170, "padding": (12, 12, 0, 0), "visible": False}
             nothing = (np.zeros(2),) * (1 + len(kinds))
             self.curves: Any = gui.add_uplot(nothing, (uplot.Series(label="time [s]"), *series), **look)
-        _add_buttons(gui, "View", {"overview": (tab.overview,), "near": (tab.look, compute_first_view)}, post)
-        _add_buttons(gui, "Film", {"film this": (tab.film,), "cancel": (tab.cancel_film,)}, post)
+        views = {"overview": (tab.overview,), "near": (tab.look, "near")}
+        films = {"film this": tab.film, "cancel": tab.cancel_film}
+        gui.add_button_group("View", tuple(views)).on_click(lambda event: post(*views[event.target.value]))
+        gui.add_button_group("Film", tuple(films)).on_click(lambda event: post(films[event.target.value]))
         self.film_status = gui.add_html("")
         with gui.add_folder("Details", expand_by_default=False):
             self.details = gui.add_markdown("")
         with gui.add_folder("Legend", expand_by_default=False):
-            names = ("slippery", "soft", "touch", "foot", "force", "command", "ghost")
-            colors = (SLIPPERY, SOFT, TOUCH, FOOT_TOUCH, FORCE_COLOR, COMMAND_COLOR, OTHER_CONTROLLER)
-            legend = TEMPLATES.get_template("legend.html").render(
-                ramp=", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0])))),
-                endings=[(ending.label, ending.color) for ending in all_endings(tab.show.space.asks).values()],
-                **dict(zip(names, map(to_hex, colors), strict=True)),
-            )
-            gui.add_html(legend)
+            ramp = ", ".join(map(to_hex, height_colors(np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))))
+            colors = {name: to_hex(color) for name, color in _LEGEND.items()}
+            endings = all_endings(tab.show.space.asks).values()
+            gui.add_html(TEMPLATES.get_template("legend.html").render(ramp=ramp, endings=endings, **colors))
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(_KEYS)
 
@@ -229,21 +217,19 @@ class CrossingPanel:
         self.curves.visible = crossing is not None
         if crossing is not None:
             chosen = np.unique(np.linspace(0, len(crossing.penalties) - 1, _CURVE_POINTS).astype(int))
-            self.curves.data = (crossing.dt * chosen, *crossing.penalties[chosen].T)
+            self.curves.data = (crossing.recording.dt * chosen, *crossing.penalties[chosen].T)
 
 
 class PlayerBar:
-    """The player bar under the scene: it shows values in the browser, and sends back what a visitor does.
+    """The player bar under the scene, where viser has no element: ``page.js`` draws it and sends what a visitor does.
 
-    ``page.js`` draws the bar, since viser has no element under the scene. It also sends keys and clicks on elites.
+    ``act`` is called in another thread with the name and value of each action, of keys and clicks on elites too.
     """
 
     def __init__(self, client: viser.ClientHandle, act: Callable[[str, Any], None]) -> None:
-        """Add the bar; ``act`` is called in another thread with the name and value of each action of a visitor."""
         self._client = client
         self._act = act
-        self.shown: dict[str, Any] = {}
-        """Values by their names in ``page.js``."""
+        self.shown: dict[str, Any] = {}  # values by their names in page.js
         panel = client.gui.add_panel()  # hidden by the script; the field of a folded panel would be gone
         panel.float(x=0.0, y=0.0)
         panel.expand()
@@ -278,14 +264,8 @@ def _small(text: str) -> str:
     return f'<div style="font-size:0.85em;padding:0.2em 0.6em">{text}</div>' if text else ""
 
 
-def _add_choice(gui: Any, label: str, options: Mapping[str, Any], act: Callable[[Any], None], hint: str = "") -> Any:
-    """A choice among values by their label."""
+def _add_choice(gui: Any, label: str, options: Iterable[str], act: Callable[[str], None], hint: str = "") -> Any:
+    """A choice whose new value is sent on if a visitor, and not this program, sets it."""
     chooser = gui.add_dropdown(label, tuple(options), hint=hint or None)
-    # Only what a visitor sets, and not what this program sets.
-    chooser.on_update(lambda event: act(options[event.target.value]) if event.client is not None else None)
+    chooser.on_update(lambda event: act(event.target.value) if event.client is not None else None)
     return chooser
-
-
-def _add_buttons(gui: Any, label: str, tasks: dict[str, tuple[Any, ...]], post: Callable[..., None]) -> None:
-    """Buttons side by side, each with what the loop is to call."""
-    gui.add_button_group(label, tuple(tasks)).on_click(lambda event: post(*tasks[event.target.value]))

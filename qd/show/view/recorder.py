@@ -18,13 +18,10 @@ _PREPARING = "the simulation is built; the very first one compiles its kernels, 
 class TaskProgress(NamedTuple):
     """How far a task is."""
 
-    task: Any
-    """A :class:`qd.show.recordings.CrossingRequest`, or a film: a partial call of :func:`qd.show.film.film`."""
-    text: str = ""
-    """An error, or what the process does where its share does not say it."""
+    task: Any  # a qd.show.recordings.CrossingRequest, or a film: a partial call of qd.show.film.film
+    text: str = ""  # an error, or what the process does where its share does not say it
     share: float = 0.0
-    result: Any = None
-    """The recording, or the film's file, when it is done."""
+    result: Any = None  # the recording, or the film's file, when it is done
     failed: bool = False
 
 
@@ -64,21 +61,22 @@ class RecordingWorker:
 
 
 class Recorder:
-    """Does the last request of each key, the oldest first; requests that are not begun are replaced."""
+    """Does the last request of each key, the oldest first; requests that are not begun are replaced.
+
+    ``robot`` is that of all tasks, set before the first one; ``report`` is called in another thread at every step
+    forward. The process imports ``build`` by its name, and calls it for what works there.
+    """
 
     def __init__(self, *, build: Callable[[Event, int], Any] = RecordingWorker) -> None:
-        """The process imports ``build`` by its name, and calls it for what works there."""
         self.robot: Any = None
-        """Robot of all tasks; set before the first one."""
         self.report: Callable[[TaskProgress], None] = lambda progress: None
-        """Called in another thread, at every step forward."""
         self._build = build
         self._cancelled = CONTEXT.Event()
         self._requests: dict[Hashable, Any] = {}  # by key, the oldest first
         self._current: Any = None
         self._stopped = False
         self._changed = threading.Condition()
-        self._worker = self._start_process()
+        self._start_process()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -93,7 +91,7 @@ class Recorder:
     def cancel(self, task: Any) -> None:
         """Drop a task, even while it runs."""
         with self._changed:
-            self._withdraw(task)
+            self._requests = {key: request for key, request in self._requests.items() if request != task}
             if self._current is not None and self._current == task:
                 self._cancelled.set()
 
@@ -105,12 +103,9 @@ class Recorder:
             self._changed.notify()
         self._thread.join(timeout=10)
 
-    def _withdraw(self, task: Any) -> None:
-        self._requests = {key: request for key, request in self._requests.items() if request != task}
-
-    def _start_process(self) -> WorkerProcess:
+    def _start_process(self) -> None:
         self._is_ready = False
-        return WorkerProcess(1, self._build, self._cancelled)
+        self._worker = WorkerProcess(1, self._build, self._cancelled)
 
     def _run(self) -> None:
         while True:
@@ -133,13 +128,13 @@ class Recorder:
                     if self._stopped:
                         return
                     self._worker.stop()
-                    self._worker = self._start_process()
+                    self._start_process()
                 result = error
             with self._changed:
                 self._current = None
                 self._cancelled.clear()
-                if result is not None:
-                    self._withdraw(task)  # other keys may have requested the same meanwhile
+            if result is not None:
+                self.cancel(task)  # other keys may have requested the same meanwhile
             if isinstance(result, Exception):
                 self.report(TaskProgress(task=task, text=str(result), failed=True))
             elif result is not None:

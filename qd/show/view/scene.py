@@ -1,20 +1,25 @@
-"""The 3-D view of a tab: terrain, start and any goal, robot, what touches, arrows and paths.
+"""The 3-D view of a tab: terrain, start and any goal, robot, what touches, arrows and paths; and one crossing as shown.
 
 Colours of vertices are in linear light, as glTF and the browser want them.
 """
 
 import math
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
 import viser
 from numpy.typing import NDArray
+from PIL import ImageColor
+from scipy.spatial.transform import Rotation
 
-from qd.show.view.playing import Crossing
+from kernels.episode import Outcome
+from qd.show.crossed import find_failure_time, get_ending, leans
 from sim.crossing import CrossingCfg
 from sim.mujoco_c.model import surface_heights
+from sim.recording.recorder import Recording
 from sim.recording.renderer import FOOT_TOUCH, OTHER_CONTROLLER, TOUCH, Color
 from sim.robots.robot import RobotCfg
 from sim.robots.skeleton import Skeleton
@@ -23,32 +28,161 @@ from sim.terrains.maps.heightmap import surface_of
 from sim.terrains.maps.picture import height_colors, places, tinted
 from sim.terrains.terrains import GroundMaps, asked_of
 
-FORCE_COLOR = (0.84, 0.10, 0.11)
-"""Arrows of contact forces, RGB, 0 to 1."""
-COMMAND_COLOR = (0.0, 0.62, 0.45)
-"""Arrow of the commanded velocity."""
+FORCE_COLOR = (0.84, 0.10, 0.11)  # arrows of contact forces, RGB, 0 to 1
+COMMAND_COLOR = (0.0, 0.62, 0.45)  # arrow of the commanded velocity
 _GOAL_COLOR = (0, 158, 115)
 SKY = np.linspace((140, 178, 214), (232, 238, 243), 256).astype(np.uint8)[:, None]
 """Background, blue above and pale below, as an image of one column."""
 _BEHIND = np.array([-1.6, -2.4, 1.5])  # from the robot to the camera that follows it [m]
-PHONE = 576
-"""Below this width viser's panels cover the lower 60 % of the picture [pixels]."""
+PHONE = 576  # below this width viser's panels cover the lower 60 % of the picture [pixels]
 _START_RADIUS = 0.25
 _DISC: Any = {"height": 0.02, "opacity": 0.5, "cast_shadow": False}
 
 Points = NDArray[np.floating]
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Where the camera stands and what it looks at [m]."""
+_VIEWS: dict[str, tuple[View, View, View]] = {  # on a phone, where the terrain's length goes up the picture, and else
+    "overview": (
+        ((-9.0, 4.0, 9.0), (-2.4, 4.0, 0.0)),
+        ((-2.6, 4.0, 9.6), (6.6, 4.0, 0.0)),
+        ((8.0, -6.3, 10.5), (8.0, 3.4, 0.0)),
+    ),
+    "near": (  # over the start along the robot's way
+        ((-3.0, 3.4, 4.2), (0.3, 3.7, 0.0)),
+        ((-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)),
+        ((-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)),
+    ),
+}
 _LINE_DARKNESS = 0.84
 _SEGMENTS = 20  # round an arrow
+_FORCE_LENGTH = 1e-3  # of an arrow [m/N]
+_LEAST_FORCE = 5.0  # shown [N]
+_COMMAND_HEIGHT = 0.45  # over the base [m]
+
+
+class Crossing(NamedTuple):
+    """One episode as it is shown, F frames."""
+
+    recording: Recording  # of one terrain
+    replica: int
+    positions: NDArray[np.float64]
+    """Origins of the bodies, world [m], shape (F, num_bodies, 3)."""
+    quaternions: NDArray[np.float64]
+    """Bodies to world, w x y z, shape (F, num_bodies, 4)."""
+    forces: NDArray[np.float64]
+    """Arrows of the feet's contact forces, begin and end [m], shape (F, num_feet, 2, 3); small forces have length 0."""
+    command: NDArray[np.float64]
+    """Arrow of the velocity command from above the base, 1 m is 1 m/s, begin and end [m], shape (F, 2, 3)."""
+    penalties: NDArray[np.float64]
+    """Scaled sums so far, in the archive's order, shape (F, P)."""
+
+    @property
+    def duration_s(self) -> float:
+        """Simulated time up to the end [s]."""
+        return float(self.recording.duration_s[0, self.replica])
+
+    @property
+    def ending(self) -> str:
+        """Outcome in words, when it came, and whether the robot has fallen."""
+        return describe_ending(self.recording, self.replica, after=f" after {self.duration_s:.1f} s")
+
+    @property
+    def failure_s(self) -> float:
+        """When it went wrong [s] (:func:`qd.show.crossed.find_failure_time`)."""
+        return find_failure_time(self.recording, self.replica)
+
+    @property
+    def marks(self) -> tuple[tuple[float, str], ...]:
+        """When something happens [s], and what."""
+        return find_marks(self.recording, self.replica)
+
+    def find_frame(self, time_s: float) -> int:
+        """The frame of a time, no further than the last."""
+        return min(round(time_s / self.recording.dt), len(self.positions) - 1)
+
+
+def trace_crossing(
+    recording: Recording, replica: int, skeleton: Skeleton, scales: Mapping[str, float]
+) -> Crossing | None:
+    """One episode, its penalties divided by their ``scales``; None if it broke before its first frame."""
+    frames = int(recording.num_frames[0, replica])
+    if frames == 0:
+        return None
+    qpos = recording.qpos(0, replica)
+    positions, quaternions = skeleton.body_poses(qpos)
+    newtons = recording.foot_force[0, replica, :frames].astype(np.float64)
+    is_shown = np.linalg.norm(newtons, axis=-1, keepdims=True) >= _LEAST_FORCE
+    shapes = [skeleton.model.geom(name) for name in recording.foot_names]
+    bodies = [foot.bodyid[0] - 1 for foot in shapes]
+    turns = [Rotation.from_quat(np.roll(quaternions[:, body], -1, axis=-1)) for body in bodies]
+    offsets = [turn.apply(foot.pos) for turn, foot in zip(turns, shapes, strict=True)]
+    feet = positions[:, bodies] + np.stack(offsets, axis=1)
+    yaw = Rotation.from_quat(np.roll(qpos[:, 3:7], -1, axis=-1)).as_euler("ZYX")[:, :1]  # commands are in its frame
+    command = recording.command[0, replica, :frames].astype(np.float64) * [1.0, 1.0, 0.0]
+    begin = qpos[:, :3] + [0.0, 0.0, _COMMAND_HEIGHT]
+    columns = [recording.penalty_names.index(name) for name in scales]
+    sums = recording.penalties[0, replica, :frames].astype(np.float64)[:, columns]
+    return Crossing(
+        recording,
+        replica,
+        positions,
+        quaternions,
+        forces=np.stack([feet, feet + np.where(is_shown, _FORCE_LENGTH * newtons, 0.0)], axis=2),
+        command=np.stack([begin, begin + Rotation.from_euler("Z", yaw).apply(command)], axis=1),
+        penalties=sums / np.array([*scales.values()]),
+    )
+
+
+def describe_ending(recording: Recording, replica: int, after: str = "") -> str:
+    """How an episode of one terrain ended, and whether the robot had fallen then."""
+    fallen = " · fallen" if recording.fallen[0, replica] else ""
+    return get_ending(recording, replica).label + after + fallen
+
+
+def find_marks(recording: Recording, replica: int) -> tuple[tuple[float, str], ...]:
+    """First stumble, first collision, fall, stuck and end of an episode that has frames, in the order of time.
+
+    Stumbles and collisions are those that the penalties count; a robot without a penalty for collisions has one
+    at the first recorded touch of base or limb. It falls when it leans further than the limit for the first time.
+    """
+    frames = int(recording.num_frames[0, replica])
+    sums = recording.penalties[0, replica, :frames]
+    grows = dict(zip(recording.penalty_names, (np.diff(sums, axis=0, prepend=sums[:1]) > 0.0).T, strict=True))
+    bodies = [k for k, name in enumerate(recording.geom_names) if name not in recording.foot_names]
+    touches = recording.touching[0, replica, :frames][:, bodies].any(axis=1)
+    events: dict[str, NDArray[np.bool_]] = {
+        "first stumble": grows.get("stumble", np.zeros(frames, bool)),
+        "first collision": grows.get("collision", touches),
+        "fall": leans(recording, replica),
+    }
+    marks = [(recording.dt * int(np.argmax(when)), label) for label, when in events.items() if when.any()]
+    if recording.outcome[0, replica] == Outcome.TIME_OUT and not events["fall"].any():
+        marks.append((find_failure_time(recording, replica), "stuck"))
+    marks.append((recording.dt * (frames - 1), f"end: {get_ending(recording, replica).label}"))
+    return tuple(sorted(marks, key=lambda mark: mark[0]))
+
+
+def group_episodes(recording: Recording) -> list[tuple[str, list[tuple[int, str]]]]:
+    """Numbers of the episodes of one terrain, from 1, and how each ended, by ending, the commonest first."""
+    groups = defaultdict[str, list[tuple[int, str]]](list)
+    for k in range(recording.num_episodes):
+        groups[get_ending(recording, k).label].append((k + 1, f"episode {k + 1}: {describe_ending(recording, k)}"))
+    commonest_first = sorted(groups.items(), key=lambda group: -len(group[1]))
+    return [(f"{len(members)} of {recording.num_episodes}: {label}", members) for label, members in commonest_first]
+
+
+def trace_paths(recording: Recording, every: int = 10) -> list[tuple[NDArray[np.float32], tuple[int, ...]]]:
+    """The base at every tenth frame and the last [m], (num_points, 3), and the outcome's colour, by episode."""
+    colors = [ImageColor.getrgb(get_ending(recording, k).color) for k in range(recording.num_episodes)]
+    chosen = [[*range(0, last, every), last] if last >= 0 else [] for last in (recording.num_frames[0] - 1).tolist()]
+    return [(recording.base_position[0, k, chosen[k]], color) for k, color in enumerate(colors)]
 
 
 class BodyShape(NamedTuple):
-    """Shapes of one body that show the same touch, in its frame."""
+    """Shapes of one body that show the same touch, columns of ``robot.geom_names``, in its frame."""
 
     body: int
     touches: tuple[int, ...]
-    """Columns of ``robot.geom_names``."""
     is_foot: bool
     mesh: trimesh.Trimesh
 
@@ -94,20 +228,10 @@ def robot_shapes(skeleton: Skeleton, robot: RobotCfg) -> list[BodyShape]:
     ]
 
 
-def compute_overview(width: int, height: int) -> View:
-    """A view of the whole terrain, for a picture of that size [pixels]."""
-    if width < PHONE:
-        return (-9.0, 4.0, 9.0), (-2.4, 4.0, 0.0)
-    if width < height:  # the terrain's length goes up the picture
-        return (-2.6, 4.0, 9.6), (6.6, 4.0, 0.0)
-    return (8.0, -6.3, 10.5), (8.0, 3.4, 0.0)
-
-
-def compute_first_view(width: int, height: int) -> View:
-    """The view at first, over the robot's start along its way, for a picture of that size [pixels]."""
-    if width < PHONE:
-        return (-3.0, 3.4, 4.2), (0.3, 3.7, 0.0)
-    return (-0.6, 0.4, 3.4), (5.6, 4.3, -0.2)
+def compute_view(name: str, width: int, height: int) -> View:
+    """A view of :data:`_VIEWS`, for a picture of that size [pixels]."""
+    phone, upright, wide = _VIEWS[name]
+    return phone if width < PHONE else upright if width < height else wide
 
 
 class Scene:
@@ -120,8 +244,7 @@ class Scene:
         scene = client.scene
         self.robot, self.bodies = self._add_bodies("/robot")
         self.shapes: list[Any] = []
-        self.touched: list[Any] = []
-        """Coloured copies of the shapes, visible in their place while they touch."""
+        self.touched: list[Any] = []  # coloured copies of the shapes, visible in their place while they touch
         for k, shape in enumerate(shapes):
             name = f"/robot/{shape.body}/{k}"
             self.shapes.append(scene.add_mesh_trimesh(name, shape.mesh, receive_shadow=False))
@@ -152,8 +275,7 @@ class Scene:
         start = CrossingCfg.start
         goal = places(asked_of(ground)).get("goal")
         scene = self._client.scene
-        color = height_colors(heights)
-        color = 255.0 * (color if ground is None else tinted(color, ground))
+        color = 255.0 * (height_colors(heights) if ground is None else tinted(height_colors(heights), ground))
         every = round(1.0 / SPACING)
         color[::every] *= _LINE_DARKNESS
         color[:, ::every] *= _LINE_DARKNESS
@@ -181,14 +303,15 @@ class Scene:
         self._followed = None
         for handle in (self.robot, self.ghost, self._command, *self.forces):
             handle.visible = False
-        self.set_paths(())
+        self.set_paths(None)
 
-    def set_paths(self, paths: Sequence[tuple[NDArray[np.float32], tuple[int, ...]]]) -> None:
-        """Show the path of the base in every episode: points [m] and a colour."""
+    def set_paths(self, recording: Recording | None) -> None:
+        """Show the path of the base in every episode of a recording, or none."""
         for handle in self.paths:
             handle.remove()
         self.paths = []
-        if paths:
+        if recording is not None:
+            paths = trace_paths(recording)
             ends = np.concatenate([np.stack([points[:-1], points[1:]], axis=1) for points, _ in paths])
             colors = np.concatenate([np.tile(color, (len(points[1:]), 2, 1)) for points, color in paths])
             look: Any = {"thickness": 1.2, "thickness_units": "screen", "visible": not self.follow}
@@ -204,11 +327,12 @@ class Scene:
 
     def show_frame(self, crossing: Crossing, frame: int) -> None:
         """Put the robot where it is at a frame of a crossing, with what touches, its forces and command."""
+        touching = crossing.recording.touching[0, crossing.replica, frame]
         with self._client.atomic():
             self.robot.visible = True
             _move_bodies(self.bodies, crossing, frame)
             for shape, alone, touched in zip(self._shapes, self.shapes, self.touched, strict=True):
-                touched.visible = bool(crossing.touching[frame, list(shape.touches)].any())
+                touched.visible = bool(touching[list(shape.touches)].any())
                 alone.visible = not touched.visible
             set_arrow(self._command, crossing.command[frame])
             for handle, arrow in zip(self.forces, crossing.forces[frame], strict=True):
@@ -217,9 +341,8 @@ class Scene:
         self._followed = base = crossing.positions[frame, 0].copy()
         if self.follow and before is None:
             self.set_follow(True)
-        elif self.follow:
-            camera = self._client.camera
-            camera.position = camera.position + (base - before)  # what it looks at goes with it
+        elif self.follow:  # what the camera looks at goes with it
+            self._client.camera.position = self._client.camera.position + (base - before)
 
     def show_ghost(self, crossing: Crossing, frame: int, label: str) -> None:
         """Put a second, translucent robot where it is at a frame of its own crossing, with a label over it."""

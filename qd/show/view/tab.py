@@ -13,13 +13,12 @@ import viser
 
 from qd.faults.families import VERDICTS
 from qd.search.directory import output_folder
-from qd.show.crossed import find_ghost_episode, find_typical_episode
-from qd.show.film import film
+from qd.show.crossed import find_ghost_episode, find_typical_episode, make_title
+from qd.show.film import Shot, film
 from qd.show.recordings import CrossingRequest, Recordings
 from qd.show.view.panels import TERRAINS, Address, ArchivePanel, Clock, CrossingPanel, PlayerBar, Selection
-from qd.show.view.playing import Crossing, group_episodes, trace_crossing, trace_paths
 from qd.show.view.recorder import Recorder, TaskProgress
-from qd.show.view.scene import BodyShape, Scene, View, compute_first_view, compute_overview
+from qd.show.view.scene import BodyShape, Crossing, Scene, compute_view, group_episodes, trace_crossing
 from qd.show.view.viewed import SEARCHED, ViewedRun, count_endings
 from sim.files.atomic import prepare_output
 from sim.recording.recorder import Recording
@@ -30,9 +29,8 @@ _BAR_S = 0.1  # real time from one update of the bar's time to the next, while p
 _ADDRESS_S = 1.0  # real time from one update of the address to the next; browsers allow three a second
 _SETTLE_S = 3.0  # a new browser may still send where its camera stood before it was moved
 _LEAD_S = 1.0  # an episode is shown from so long before the robot fails
-CERTIFIER = "who certifies it"
+CERTIFIER = "who certifies it"  # a ghost to choose: the certifier of the elite, if it is at hand
 NO_GHOST = "none"
-"""Ghosts to choose beside the controllers: the certifier of the elite, if it is at hand, and none."""
 
 
 class Shared(NamedTuple):
@@ -43,17 +41,15 @@ class Shared(NamedTuple):
     shapes: list[BodyShape]
     recordings: Recordings
     recorder: Recorder
-    post: Callable[..., None]
-    """Has the loop call a function with arguments."""
+    post: Callable[..., None]  # has the loop call a function with arguments
 
 
 @dataclass(eq=False)
 class ShownController:
-    """The controller that is shown, or the ghost beside it."""
+    """The controller that is shown, or the ghost beside it; the recorder works on the last request of each key."""
 
     shared: Shared
     key: Hashable
-    """The recorder works on the last request of each."""
     name: str | None = None
     request: CrossingRequest | None = None
     recording: Recording | None = None
@@ -62,11 +58,9 @@ class ShownController:
     def load(self, elite: int, name: str | None, *, minimal: bool = False) -> None:
         """Load the recording of another elite or controller, or request it."""
         self.name = name
-        self.recording = None
         self.crossing = None
         self.request = self.shared.show.request(elite, name, minimal=minimal)
-        if self.request is not None:
-            self.recording = self.shared.recordings.read(self.request)
+        self.recording = self.request and self.shared.recordings.read(self.request)
         self.shared.recorder.request(self.request if self.recording is None else None, key=self.key)
 
     def take(self, progress: TaskProgress) -> bool:
@@ -103,8 +97,7 @@ class Tab:
         self._prefers_minimal = False  # show the minimal terrain of elites that have one
         self.replica: int | None = None  # None: the typical one
         self._begin_s: float | None = None  # where the next crossing begins; None: just before the robot fails
-        self.address = Address()
-        """What the browser's address says."""
+        self.address = Address()  # what the browser says
         self._film: partial[None] | None = None
         self._bar_time = 0.0  # when they were updated last
         self._address_time = time.perf_counter()
@@ -168,10 +161,8 @@ class Tab:
             self.choose_replica(address.episode - 1, address.time_s, playing=self.clock.playing)
         has_camera = None not in (address.position, address.look_at)
         if not has_camera:
-            self.look(compute_first_view)
-        self.selection.picked = elite
-        self.list.show()
-        self._show_elite()
+            self.look("near")
+        self._show_elite(elite)
         self._settled_time = time.perf_counter() + _SETTLE_S
         self.set_follow(address.follow or (address.time_s is None and not has_camera))
 
@@ -227,9 +218,10 @@ class Tab:
         except (OSError, ValueError) as error:
             self.panel.show_film(f"No film: {error}")
             return
-        beside = None if self.ghost.recording is None else (self.ghost.name, self.ghost.recording)
-        look: Any = {"episode": self.replica, "by": by, "beside": beside}
-        self._film = partial(film, self.robot.recording, self.show.robot, self.show.scales, out=file, **look)
+        recording = self.robot.recording
+        beside = None if self.ghost.recording is None else (str(self.ghost.name), self.ghost.recording)
+        shot = Shot(recording=recording, episode=self.replica, title=make_title(recording, by), beside=beside)
+        self._film = partial(film, shot, self.show.robot, out=file)
         self.panel.show_film("Filming: the film process starts …")
         self.shared.recorder.request(self._film, key=(self.client.client_id, "film"))
 
@@ -250,7 +242,7 @@ class Tab:
         if minimal != self._prefers_minimal:
             self._prefers_minimal = minimal
             self._begin(None)
-            self._show_elite()
+            self._show_elite(self.selection.picked)
 
     def _begin(self, replica: int | None, begin_s: float | None = None, *, playing: bool = True) -> None:
         """Note which episode to show from when on, as soon as it is recorded."""
@@ -265,14 +257,14 @@ class Tab:
     def _refuse_elite(self, number: object) -> None:
         self.refuse(f"There is no elite {number} here: there are 0 to {len(self.show.archive) - 1}.")
 
-    def look(self, compute_view: Callable[[int, int], View]) -> None:
-        """Move the camera to a view that depends on the window's width and height."""
-        self.scene.go_to(compute_view(*self.window))
+    def look(self, view: str) -> None:
+        """Move the camera to a view of its name."""
+        self.scene.go_to(compute_view(view, *self.window))
 
     def overview(self) -> None:
         """Show the whole terrain, and stop following."""
         self.set_follow(False)
-        self.look(compute_overview)
+        self.look("overview")
 
     def pick(self, text: str | int) -> None:
         """Show the elite of a number, just before the robot fails, or refuse the number."""
@@ -280,10 +272,8 @@ class Tab:
         if not 0 <= number < len(self.show.archive):
             self._refuse_elite(f"'{text}'")
         elif number != self.selection.picked:
-            self.selection.picked = number
             self._begin(None)
-            self.list.show()
-            self._show_elite()
+            self._show_elite(number)
 
     def choose_controller(self, name: str) -> None:
         """Show the crossings of another controller."""
@@ -305,7 +295,7 @@ class Tab:
             return
         self._begin(replica, begin_s, playing=playing)
         if self.robot.recording is not None:
-            self._show_episode()
+            self._show_episode(replica)
 
     def play(self, playing: bool) -> None:
         """Play or pause."""
@@ -332,14 +322,14 @@ class Tab:
     def show_progress(self, progress: TaskProgress) -> None:
         """Show how far a recording or film is, and what it made, if this tab requested it."""
         if self._film is not None and progress.task is self._film:
-            if progress.failed or progress.result is not None:
-                self._film = None
             text = f"No film: {progress.text}" if progress.failed else f"Filming: {progress.share:.0%}"
             if progress.result is not None:
                 content = progress.result.read_bytes()
                 size = f"{len(content) / 1e6:.1f} MB"
                 text = f"{progress.result} ({size}): click to download it in the notice on the picture."
                 self.client.send_file_download(progress.result.name, content)
+            if progress.failed or progress.result is not None:
+                self._film = None
             self.panel.show_film(text)
         if self.ghost.take(progress):
             self._show_ghost(f"no ghost: {progress.text}" if progress.failed else f"{progress.share:.0%}")
@@ -351,7 +341,7 @@ class Tab:
         elif progress.failed:
             self.bar.show({"share": None, "status": f"No crossing: {escape(progress.text)}"})
         else:
-            self._show_share(progress.text, progress.share)
+            self._show_share(progress)
 
     def leave(self) -> None:
         """Withdraw all requests; the browser is gone."""
@@ -360,9 +350,10 @@ class Tab:
         self.ghost.load(self.selection.picked, None)
         self.cancel_film()
 
-    def _show_elite(self) -> None:
+    def _show_elite(self, elite: int) -> None:
         show = self.show
-        elite = self.selection.picked
+        self.selection.picked = elite
+        self.list.show()
         name = show.ranking.name(elite)
         minimal_genes = show.minimal_genes(elite)
         genes = minimal_genes if self.minimal and minimal_genes is not None else show.archive.genes[elite]
@@ -386,12 +377,10 @@ class Tab:
 
     def _load_ghost(self) -> None:
         """Load or request the ghost's recording of the shown elite, and show it."""
-        show = self.show
-        name: str | None = self.ghost_choice
-        self._ghost_note = ""
+        name, self._ghost_note = self.ghost_choice, ""
         if self.ghost_choice == CERTIFIER:
-            name, self._ghost_note = show.find_certifier(self.selection.picked)
-        is_ghost = name in show.controllers and name != self.controller
+            name, self._ghost_note = self.show.find_certifier(self.selection.picked)
+        is_ghost = name in self.show.controllers and name != self.controller
         self.ghost.load(self.selection.picked, name if is_ghost else None, minimal=self._prefers_minimal)
         self.panel.ghost.value = self.ghost_choice
         self._show_ghost()
@@ -399,12 +388,11 @@ class Tab:
 
     def _show_ghost(self, text: str = "is recorded") -> None:
         """Show the ghost in the same episode or in one that arrives; the longer of both crossings sets the duration."""
-        replica = self.replica or 0
-        recording = self.ghost.recording
-        ghost_replica = replica if recording is None else find_ghost_episode(recording, replica, self.show.scales)
+        replica = ghost_replica = self.replica or 0
+        if self.ghost.recording is not None:
+            ghost_replica = find_ghost_episode(self.ghost.recording, replica, self.show.scales)
         self.ghost.show_episode(ghost_replica)
-        crossing = self.robot.crossing
-        ghost = self.ghost.crossing
+        crossing, ghost = self.robot.crossing, self.ghost.crossing
         self.scene.ghost.visible = False
         if crossing is None:
             return
@@ -420,41 +408,40 @@ class Tab:
         self.bar.show({"duration": duration_s, "status": escape(" · ".join(filter(None, (crossing.ending, note))))})
         self._show_frame()
 
-    def _show_share(self, text: str, share: float) -> None:
-        task = f"Recording {CrossingRequest.replicas} episodes of {self.controller}: {text or f'{share:.0%}'}"
-        self.bar.show({"share": share, "task": task})
+    def _show_share(self, progress: TaskProgress) -> None:
+        done = progress.text or f"{progress.share:.0%}"
+        task = f"Recording {CrossingRequest.replicas} episodes of {self.controller}: {done}"
+        self.bar.show({"share": progress.share, "task": task})
 
     def _show_crossings(self) -> None:
         """Show the picked elite's crossings, or have them recorded."""
-        show = self.show
+        show, elite = self.show, self.selection.picked
         policy = None if self.controller in (None, SEARCHED) else show.controllers[self.controller]
-        terrain = {"minimal" if self.minimal else "elite": self.selection.picked}
-        command = show.command("replay", policy=policy, **terrain)
-        self.panel.details.content = f"{show.details(self.selection.picked)}\n\n`{command}`"
+        command = show.command("replay", policy=policy, **{"minimal" if self.minimal else "elite": elite})
+        self.panel.details.content = f"{show.details(elite)}\n\n`{command}`"
         self.scene.hide_crossing()
         self.clock.duration_s = 0.0
         self.panel.show_curves(None)
         self.bar.show({"enabled": False, "status": "", "marks": [], "episodes": [], "share": None})
-        self.robot.load(self.selection.picked, self.controller, minimal=self._prefers_minimal)
+        self.robot.load(elite, self.controller, minimal=self._prefers_minimal)
         self._load_ghost()
         if self.robot.recording is not None:
             self._show_recording(self.robot.recording)
         elif self.robot.request is None:
             self.bar.show({"status": f"No crossing: {escape(show.note)}"})
         else:
-            self._show_share("", 0.0)
+            self._show_share(TaskProgress(self.robot.request))
 
     def _show_recording(self, recording: Recording) -> None:
-        if self.replica is None:
-            self.replica = find_typical_episode(recording, self.show.scales)
+        replica = find_typical_episode(recording, self.show.scales) if self.replica is None else self.replica
         self.bar.show({"share": None, "episodes": group_episodes(recording)})
         self._show_rates()
-        self.scene.set_paths(trace_paths(recording))
-        self._show_episode()
+        self.scene.set_paths(recording)
+        self._show_episode(replica)
 
-    def _show_episode(self) -> None:
-        assert self.replica is not None
-        self.robot.show_episode(self.replica)
+    def _show_episode(self, replica: int) -> None:
+        self.replica = replica
+        self.robot.show_episode(replica)
         crossing = self.robot.crossing
         self.panel.show_curves(crossing)
         self.bar.show({"status": "This episode broke at once."})
@@ -462,8 +449,8 @@ class Tab:
         if crossing is not None:
             self.clock.begin_s = max(0.0, crossing.failure_s - _LEAD_S)
             self.seek(self.clock.begin_s if self._begin_s is None else self._begin_s)
-        marks = [] if crossing is None else list(crossing.marks)
-        self.bar.show({"enabled": crossing is not None, "marks": marks, "episode": self.replica + 1})
+        marks = crossing.marks if crossing is not None else []
+        self.bar.show({"enabled": crossing is not None, "marks": marks, "episode": replica + 1})
         self._show_time()
 
     def _show_frame(self) -> None:

@@ -25,10 +25,8 @@ from sim.rates import rate_labels
 from sim.recording.recorder import Recording
 from sim.terrains.maps.picture import places
 
-SEARCHED = "searched controller"
-"""Name of the search's controller on the page, if no other is given."""
+SEARCHED = "searched controller"  # on the page, if no other is given
 TEMPLATES = open_templates(Path(__file__).parent / "templates")
-"""HTML of the page."""
 _GREY = "#d8d8d8"
 _LISTED = "#2171b5"
 _PICKED = "#d55e00"
@@ -36,7 +34,6 @@ FITNESS_TEXT = (
     "what the search looks for: mean scaled penalties, less their spread over episodes, less a share of episodes "
     "without a base collision where others have one; whether the robot fails is said by how often it passes"
 )
-"""What fitness is, and what it is not."""
 
 Column = tuple[str, int, Mapping[str, int]]
 """A head, a number of episodes, and how many of them count for each rate of the table."""
@@ -46,23 +43,15 @@ Column = tuple[str, int, Mapping[str, int]]
 class ViewedRun(OpenedRun):
     """What the viewer shows: a run of at least one elite."""
 
-    elite: int | None = None
-    """Which to show first; None for the first of the list."""
-    minimal: bool = False
-    """Whether the first terrain is the elite's minimal one."""
-    controllers: dict[str, str]
-    """File or code of each controller, by its name; empty if the search's controller is lost."""
-    note: str = ""
-    """Why there is no controller; empty if there is one."""
+    elite: int | None = None  # which to show first; None for the first of the list
+    minimal: bool = False  # whether the first terrain is the elite's minimal one
+    controllers: dict[str, str]  # file or code of each, by its name; empty if the search's controller is lost
+    note: str = ""  # why there is no controller; empty if there is one
 
     @cached_property
     def ranking(self) -> Ranking:
         """All elites, their causes and families."""
         return self.rank()
-
-    @cached_property
-    def _orders(self) -> dict[str, NDArray[np.int64]]:
-        return {name: self.ranking.order(name) for name in self.ranking.orders}
 
     @cached_property
     def _names(self) -> list[str]:
@@ -92,7 +81,7 @@ class ViewedRun(OpenedRun):
 
     def list_elites(self, cause: str = "", order: str = next(iter(ORDERS))) -> NDArray[np.int64]:
         """Numbers of the elites of a cause, or of all, in one of the :data:`qd.faults.families.ORDERS`."""
-        numbers = self._orders[order]
+        numbers = self.ranking.order(order)
         return numbers[np.isin(numbers, self.ranking.by_cause()[cause])] if cause else numbers
 
     def causes(self) -> dict[str, str]:
@@ -120,11 +109,10 @@ class ViewedRun(OpenedRun):
 
     def columns(self, number: int) -> Sequence[Column]:
         """Episodes on the whole terrain: fresh, finer contact, varied conditions, and of the best certifier."""
-        ranking = self.ranking
-        archive = self.archive
-        first = "fresh" if ranking.is_fresh[number] else "as found"
+        ranking, archive = self.ranking, self.archive
         rates = rate_labels(self.space.asks)
         hits = {name: ranking.hits(name, number) for name in rates}
+        first = "fresh" if ranking.is_fresh[number] else "as found"
         columns: list[Column] = [(first, int(ranking.counted[number]), hits)]
         further = {"finer contact": archive.resolved_outcomes[number]}
         if archive.varied is not None:
@@ -140,14 +128,14 @@ class ViewedRun(OpenedRun):
         """All else that is known of an elite, as Markdown."""
         ranking = self.ranking
         kin = int((ranking.families == ranking.families[number]).sum()) - 1
+        minimal = "" if self.minima is None or number not in self.minima.genes else self.minima.describe(number)
+        found = f"{self.archive.fitness[number]:.2f} as found in iteration {self.archive.iteration[number]}"
         paragraphs = [
+            *[f"**Minimal terrain**: {minimal}."] * bool(minimal),
             *describe_judgement(self.archive, number),
             f"{kin or 'No'} other elite{'s' * (kin > 1)} like it.",
-            f"Fitness **{ranking.fitness[number]:.2f}** ({self.archive.fitness[number]:.2f} as found in "
-            f"iteration {self.archive.iteration[number]}): {FITNESS_TEXT}.",
+            f"Fitness **{ranking.fitness[number]:.2f}** ({found}): {FITNESS_TEXT}.",
         ]
-        if self.minima is not None and number in self.minima.genes:
-            paragraphs.insert(0, f"**Minimal terrain**: {self.minima.describe(number)}.")
         return "\n\n".join(paragraphs)
 
 

@@ -16,8 +16,7 @@ from qd.faults.families import VERDICTS, rank, summarise_search
 from qd.search.archive import read_archive, write_archive
 from qd.show.elites import open_run
 from qd.show.figures import draw_archive, draw_curves, relief, write_figures
-from qd.show.report.evaluation import compare_controllers
-from qd.show.report.page import TILE, choose_moments, draw_sheet, percent
+from qd.show.report.page import TILE, choose_moments, draw_sheet, open_pages, percent
 from qd.show.report.report import count_causes, write_report
 from sim.controllers.spec import controller_hash
 from sim.files.atomic import to_json
@@ -210,6 +209,9 @@ def test_tables_are_shown_where_they_are_asked_for(reported, run, anymal):
     assert "generated, held out (4) base 50 % (10 to 90) C-G -" in text
     assert "generated, held out: base -> C-G 1 1 1 1 4" in text  # mended, still failing, newly broken, fine, compared
     assert "generated, held out (2) base 50 % (10 to 90), searched C-G -" in text
+    assert "None of these controllers" not in text
+    write_archive(run / "archive.npz", dataclasses.replace(read_archive(run), policy_sha256="f" * 64))
+    assert "None of these controllers" in text_of(reported(tables=file)[0].read_bytes())
 
 
 def test_of_several_trainings_each_is_shown_and_the_mean_over_their_seeds():
@@ -221,11 +223,10 @@ def test_of_several_trainings_each_is_shown_and_the_mean_over_their_seeds():
         "intervals": {measure: {"near": limits} for measure in MEASURES},
         "over_seeds": {measure: {"near": {"C-G": over}} for measure in MEASURES},
     }  # fmt: skip
-    compared = compare_controllers(several, searched="1")
-    words, goals = compared["measures"][0]
-    assert not compared["of_searched"] and words == "goal reached" and goals.head == ["controller", "near (4)"]
-    expected = [["base", "50 % (40 to 60)"], ["C-G", "60 % (50 to 70)"], ["C-G@1", "80 %"], ["C-G, mean of 2", "70 %"]]
-    assert goals.rows == expected
+    macros = open_pages().get_template("macros.html").module
+    text = text_of(macros.compared_tables(several).encode())
+    rows = "base 50 % (40 to 60) C-G 60 % (50 to 70) C-G@1 80 % C-G, mean of 2 70 %"
+    assert f"Goal reached controller near (4) {rows}" in text and "What became of" not in text
 
 
 SETS = ("hand_crafted", "search-0")

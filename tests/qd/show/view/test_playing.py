@@ -6,8 +6,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kernels.episode import Outcome
-from qd.show.view.playing import find_marks, group_episodes, trace_crossing, trace_paths
-from qd.show.view.scene import arrow_mesh, robot_shapes, set_arrow
+from qd.show.view.scene import (
+    arrow_mesh,
+    find_marks,
+    group_episodes,
+    robot_shapes,
+    set_arrow,
+    trace_crossing,
+    trace_paths,
+)
 from sim.robots.skeleton import Skeleton
 from tests.qd.recordings import recording_of
 
