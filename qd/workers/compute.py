@@ -70,7 +70,7 @@ def choose_device(name: str | None, workers: str | None = None) -> str:
     if not on_ray:
         device = resolve_device(name)
         if device.startswith("cuda") and (count or 1) > 1:
-            raise ValueError(f"{count} workers need the CPU, got {device}: give --device cpu, or --workers ray:N")
+            raise ValueError(f"{count} workers need the CPU, got device {device}: give --device cpu or --workers ray:N")
         return device
     connect(count)
     if name not in (None, "cpu", "cuda"):
