@@ -226,15 +226,15 @@ def sum_forces(contacts: Contacts, column_of_shape: wp.array[int], geom_force_ou
             touching += 1
     if touching > 2:  # the order of two changes nothing
         force = wp.vec3(0.0)
-        added = int(-1)  # rank of the last contact
+        added = int(-1)  # place of the last contact
         for _ in range(touching):
             following = int(-1)
             least = int(2147483647)
             for c in range(count):
-                rank = contacts.rank[env, c]
-                if rank > added and rank < least and column_of_shape[contacts.shape[env, c]] == column:
+                place = count * contacts.rank[env, c] + c  # no two are the same
+                if place > added and place < least and column_of_shape[contacts.shape[env, c]] == column:
                     following = c
-                    least = rank
+                    least = place
             force += contacts.force[env, following]
             added = least
     geom_force_out[env, column] = force

@@ -18,7 +18,7 @@ using Vec2 = wp::vec_t<2, float>;
 using Vec5 = wp::vec_t<5, float>;
 float* inertia = memory;  // NV x NV, rows LD apart as all are
 float* vector = inertia + NV * LD;  // operand of products, one number a dof
-float* part = vector + LD;  // CHUNK x DIM x NV; also two rows in a factorisation
+float* part = vector + LD;  // CHUNK x DIM x NV; also four rows in a factorisation
 float* coefficient = part + CHUNK * DIM * LD;  // CHUNK x DIM x DIM
 Contact* shared_contacts = (Contact*)(coefficient + (CHUNK * DIM * DIM + 3) / 4 * 4);
 constexpr int NUM_FLOATS = (NV + 1 + CHUNK * DIM) * LD + (CHUNK * DIM * DIM + 3) / 4 * 4 + NUM_SHARED * sizeof(Contact) / 4;
@@ -175,6 +175,7 @@ auto solve = [&](LaneRows& h, LaneVector& y) {
         }
         return;
     }
+    sync();  // the last pair of a former call may be read still
     #pragma unroll
     for (int k = 0; k < NV - 1; k += 2) {
         float *row = part + k / 2 % 2 * 2 * LD, *next = row + LD;  // two pairs in turn: slow lanes may still read the other

@@ -326,8 +326,10 @@ class Rollout:
         if terrains.genes is not None and spaces[0] != spaces[1]:
             raise ValueError(f"genes must be of the space {self.space.name} here, got {terrains.space.name}")
         asks = terrains.ground is not None and (terrains.ground.rows[:, -1] == Kind.ROUTE).any()
-        if asks and self.cfg.stray_m is None:
-            raise ValueError("heights with routes need CrossingCfg.stray_m, got None: give it, or genes of a space")
+        if asks and (self.cfg.stray_m is None or self.trail is None):
+            raise ValueError(
+                "heights with routes need with_conditions and CrossingCfg.stray_m: give both, or genes of a space"
+            )
         num_ways = 0 if terrains.steering is None else terrains.steering.shape[1]
         if num_ways != (self.replicas if self._queue.steering.shape[0] else 0):
             raise ValueError(f"terrains must have {self.replicas} ways each if with_steering, else 0, got {num_ways}")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kernels.episode import Kind
+from qd.check import ensure_stray
 from qd.evaluate.sets import plain_set
 from qd.faults import numbers as faults
 from qd.faults.families import find_failing_causes, find_families, judged_numbers
@@ -381,6 +382,8 @@ def judge(
         raise ValueError(f"stages must be some of {', '.join(STAGES)}, got {', '.join(unknown)}")
     ask = any(STAGES[name].asks_certifiers for name in stages)
     search = find_search(run, robot=robot, policy=policy, space=space)
+    if search.space.asks == Kind.ROUTE:
+        ensure_stray(search.robot, search.policy, compute)
     with open_judging(search, compute, certifiers, ask=ask) as judging:
         archive = search.read_archive()
         if archive.fresh is None and stages and stages[0] != "fresh":

@@ -61,8 +61,6 @@ def start_search(
     check_conditions(terrain_space.conditions, wanted, observed_terms(policy or wanted.policy_file))
     ready = ensure_ready(wanted, policy, compute, skip_level_ground=skip_level_ground)
     terrain_space = space_at(terrain_space, height, ready)
-    if terrain_space.asks == Kind.ROUTE:
-        ensure_stray(ready, policy, compute)
     name, sha256 = terrain_space.name, terrain_space.sha256
     return preset(size, ready, policy, space=name, space_sha256=sha256, likely=likely), ready
 
@@ -89,6 +87,8 @@ def search(
     policy = policy or resolve_policy(cfg.policy, robot)
     check_policy(policy, robot, compute.device)
     space = cfg.terrain_space
+    if space.asks == Kind.ROUTE:
+        ensure_stray(robot, policy, compute)
     run = RunDirectory(path)
     crossing = PipelineCfg(
         compute=compute, robot=robot, policy=policy, num_terrains=cfg.scheduler.num_terrains, replicas=cfg.replicas,

@@ -293,7 +293,8 @@ class Described(torch.nn.Module):
         names = joints if names is None else names
         unknown = [name for name in names if name not in joints]
         if unknown or len(set(names)) < len(names):
-            self._refuse(f"{setting} must be the robot's, each once, got {', '.join(unknown or names)}, not {joints}")
+            got = ", ".join(unknown or names)
+            self._refuse(f"{setting} must be the robot's, each once, got {got}: it has {', '.join(joints)}")
         return tuple(joints.index(name) for name in names)
 
     def _find_columns(self, term: Term) -> Sequence[int]:

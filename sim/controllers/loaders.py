@@ -192,7 +192,19 @@ def _try_rows(policy: Any, sizes: tuple[int, int], device: str, spec: str, label
         raise ValueError(f"policy '{spec}' returned actions that are not finite for a zero observation: mend it first")
 
 
+@contextmanager
+def _in_full_precision() -> Iterator[None]:
+    """Lets matrices be multiplied in float32: TF32 may round a row otherwise beside fewer others."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
 @torch.inference_mode()
+@_in_full_precision()
 def _separates_rows(policy: Any, width: int, device: str) -> bool:
     """Whether a robot that begins an episode gets the same action beside any others, whatever steps came before."""
     first_actions, generator = [], torch.Generator().manual_seed(0)

@@ -447,7 +447,8 @@ def file_problems(robot: RobotCfg, file: RobotFile) -> list[str]:
         beyond = np.flatnonzero(~((low - _SLACK <= pose) & (pose <= high + _SLACK)))
         if len(beyond):
             listed = ", ".join(f"{names[k]} ({low[k]:g} to {high[k]:g}, got {pose[k]:g})" for k in beyond)
-            problems.append(f"default_joint_pos is outside of the file's range for {listed}: angles are in radians")
+            degrees = ": angles are in radians" if np.abs(pose).max() > 2.0 * np.pi else ""
+            problems.append(f"default_joint_pos is outside of the file's range for {listed}{degrees}")
     limitless = ", ".join(name for name, effort in zip(names, drives.effort, strict=True) if np.isinf(effort))
     if limitless and (file.is_urdf or robot.saturation_effort) and robot.effort_limit is None:
         problems.append(f"no torque limit above 0 for {limitless}: give it in the file or by effort_limit")

@@ -34,7 +34,9 @@ def read_isaac_lab(path: Path, source: Source) -> Path:
     agent = read_yaml(agent_file) if agent_file.is_file() else {}
     articulation = env["scene"]["robot"]
     source.find_model_file((articulation.get("spawn") or {}).get("asset_path"))
-    pose = per_joint(articulation["init_state"]["joint_pos"], source.joints, f"{source.file}: joint_pos", partly=True)
+    pose = per_joint(
+        articulation["init_state"]["joint_pos"], source.joints, f"{source.file}: init_state.joint_pos", partly=True
+    )
     source.set(default_joint_pos=collapse([angle or 0.0 for angle in pose]))
     _read_actuators(articulation["actuators"], source)
     source.set(physics_dt=env["sim"]["dt"], decimation=env["decimation"])

@@ -78,8 +78,9 @@ class Source:
 
     def refuse_unknown(self, names: Iterable[str], known: Iterable[str]) -> None:
         """Raises a ValueError with the names that are not known."""
-        if unknown := ", ".join(str(name) for name in names if name not in known):
-            raise ValueError(f"{self.file} says what is not understood: {unknown}: take it out if it does not matter")
+        if unknown := [str(name) for name in names if name not in known]:
+            listed = ", ".join(unknown)
+            raise ValueError(f"{self.file} says what is not understood: {listed}: take it out if it does not matter")
 
     def move(self, content: dict[str, Any], names: Mapping[str, str], joints: Sequence[str]) -> None:
         """Moves values from ``content`` to settings of other names; lists in the order of ``joints`` are reordered."""
