@@ -193,17 +193,23 @@ def make_begin(effects: Effects) -> Callable[..., None]:
 
 
 @cache
-def make_meet(effects: Effects) -> Callable[..., None]:
-    """What meets each robot before its next control step: it changes the velocities ``joint_qd``, or is remembered."""
+def make_robot_stage(effects: Effects, struct: Any, counts: bool = False) -> Callable[..., None]:
+    """What acts on each robot in a stage, by a step of the type ``struct``; the one that ``counts`` ends a step.
+
+    The stage ``meet`` changes velocities before a control step, or remembers; ``drive`` changes the joint targets in
+    effect before the dynamics find forces by them; ``force`` adds forces before constraints are solved.
+    """
 
     @kernel_over("step.memory.steps", module="unique")
-    def meet(step: DisturbedStep):
+    def act(step: struct):
         """Grid (num_envs,)."""
         env = wp.tid()
         for k in range(wp.static(len(effects))):
             wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
+        if wp.static(counts):
+            step.memory.steps[env] += 1
 
-    return meet
+    return act
 
 
 @cache
@@ -218,32 +224,3 @@ def make_disturb(effects: Effects) -> Callable[..., None]:
             wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env, column)
 
     return disturb
-
-
-@cache
-def make_drive(effects: Effects) -> Callable[..., None]:
-    """What changes the joint targets in effect, before the dynamics find forces by them."""
-
-    @kernel_over("step.memory.steps", module="unique")
-    def drive(step: ForcedStep):
-        """Grid (num_envs,)."""
-        env = wp.tid()
-        for k in range(wp.static(len(effects))):
-            wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
-
-    return drive
-
-
-@cache
-def make_force(effects: Effects) -> Callable[..., None]:
-    """What adds forces to those that the dynamics have found, before constraints are solved, and counts the steps."""
-
-    @kernel_over("step.memory.steps", module="unique")
-    def force(step: ForcedStep):
-        """Grid (num_envs,)."""
-        env = wp.tid()
-        for k in range(wp.static(len(effects))):
-            wp.static(effects[k][0])(step, step.memory.row[env], wp.static(effects[k][1]), env)
-        step.memory.steps[env] += 1
-
-    return force

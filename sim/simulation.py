@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels.actuator_net import make_torques
-from kernels.conditions import Disturbed, DisturbedStep, make_begin, make_disturb, make_drive, make_force, make_meet
+from kernels.conditions import Disturbed, DisturbedStep, ForcedStep, make_begin, make_disturb, make_robot_stage
 from kernels.contact import Poses, collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, to_solver
 from kernels.episode import Episodes, Outcome
@@ -328,7 +328,7 @@ class Simulation:
             values |= {"memory": self.disturbed, "episodes": episodes, "observation": observation}
             values["terrain"] = self.bank.terrain
             step = make_struct(DisturbedStep, self, **values)
-            make_meet(condition_effects("meet"))(step)
+            make_robot_stage(condition_effects("meet"), DisturbedStep)(step)
             make_disturb(condition_effects("disturb"))(step)
 
     def collide(self) -> None:
@@ -346,14 +346,14 @@ class Simulation:
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
             to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
             if self.disturbed is not None and self.robot.arm_joints:
-                make_drive(condition_effects("drive"))(self._forced)
+                make_robot_stage(condition_effects("drive"), ForcedStep)(self._forced)
             if self._net is not None:
                 self._write_torques(self.joint_q, self.joint_qd, *self._net, coordinates)
             if self.motors is not None:
                 limit_torques(self.joint_qd, coordinates, self.motors, solver.mjw_model.actuator_forcerange)
             self.dynamics.find()
             if self.disturbed is not None:
-                make_force(condition_effects("force"))(self._forced)
+                make_robot_stage(condition_effects("force"), ForcedStep, counts=True)(self._forced)
             self.collide()
             self.dynamics.step()
             from_solver(coordinates, self.joint_q, self.joint_qd)

@@ -282,7 +282,7 @@ def _check_mujoco_c(archive: Archive, judging: Judging, before: Collection[str])
     _check_faults(archive, judging, before, "mujoco_c", "others", "steered")
 
 
-def cross_in_mujoco_c(archive: Archive, judging: Judging) -> Archive:
+def try_in_mujoco_c(archive: Archive, judging: Judging) -> Archive:
     """Crosses faults in MuJoCo C with contact resolved, by the controller, and where it fails by a certifier."""
     _check_certifiers(archive, judging, steered=True)
     search = judging.search
@@ -358,7 +358,7 @@ STAGES = {
     "others": Stage(cross_by_others),
     "steered": Stage(cross_steered, check=_check_steered),
     "varied": Stage(cross_varied, check=_check_varied),
-    "mujoco_c": Stage(cross_in_mujoco_c, check=_check_mujoco_c),
+    "mujoco_c": Stage(try_in_mujoco_c, check=_check_mujoco_c),
 }
 
 
