@@ -1,8 +1,8 @@
 """The published packs, sim/robots/<robot>/packs: 100 terrains that can be crossed, and how often controllers do.
 
-They come from two searches of their own, of preset wide to 192,000 episodes, judged by the panel and by witnesses. No
-controller of theirs has trained on them, nor on kin of them: C-G trained on the published archive. The hardened one is
-left out, since no archive of its rounds is published to compare with. A published pack does not change.
+They come from two searches of their own, of preset wide to 192,000 episodes, judged by the panel. No controller of
+theirs has trained on them, nor on kin of them: C-G trained on the published archive. The hardened one is left out,
+since no archive of its rounds is published to compare with. A published pack does not change.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ VERSION = 2
 SEEDS = (7000, 7001)
 """Of the searches, which no other search has."""
 EPISODES = 192_000
-STAGES = ("fresh", "resolved", "others", "steered")
+STAGES = ("fresh", "resolved", "others")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
