@@ -22,18 +22,18 @@ STAGES = ("fresh", "resolved", "others")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Searches, judges, chooses the terrains, and lets controllers cross them; parts are searches alone.
+    """Searches, judges, chooses the terrains, and lets controllers cross them; each search and the rest are parts.
 
     A trial takes terrains of the published archive.
     """
-    names = tuple(f"search {seed}" for seed in SEEDS)
+    names = (*(f"search {seed}" for seed in SEEDS), "choose")
     script = parse(__doc__, argv, f"packs/{VERSION}/pack.json", published="sim/robots", parts=names)
-    runs = [script.runs / "packs" / str(seed) for seed in SEEDS]
-    for name, seed, run in zip(names, SEEDS, runs, strict=True):
-        if not script.small and name in (script.parts or names):
+    runs, parts = [script.runs / "packs" / str(seed) for seed in SEEDS], script.parts or names
+    for name, seed, run in zip(names, SEEDS, runs, strict=False):
+        if not script.small and name in parts:
             search(script.search_cfg(episodes=EPISODES, seed=seed), run, script.compute)
             judge(run, stages=STAGES, compute=script.compute)
-    if script.parts:
+    if "choose" not in parts:
         return
     if script.small:
         runs = [script.run_of_archive()]
