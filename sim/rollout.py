@@ -141,7 +141,7 @@ class Rollout:
     for a single lot.
 
     An episode depends on its terrain, the terrain's seed and its replica alone, whichever robot runs it beside whatever
-    others; on the CPU bit for bit, if its controller gives a row the same action in any batch.
+    others; bit for bit, if its controller gives a row the same action in any batch.
 
     Attributes:
         sim: The robots' simulation.

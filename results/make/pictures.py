@@ -37,8 +37,14 @@ STILL_SIZE = (640, 360)
 """Width and height [pixels]."""
 CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "hole.npz", "a hole", "C-G"))
 """Robot, terrain, what it is in words, and the controller of the panel that is shown beside."""
-FILMED = {"estimate": "anymal", "grip": "cassie", "map_drift": "anymal", "push_2": "anymal"}
-"""Conditions of which a robot's smallest example is filmed."""
+FILMED = {
+    "estimate": ("anymal", "conditions"),
+    "grip": ("cassie", "conditions"),
+    "map_drift": ("anymal", "conditions"),
+    "push_2": ("anymal", "conditions"),
+    "segment_1": ("anymal", "route"),
+}
+"""Conditions of which the smallest example of a robot's search is filmed."""
 FILM_SIZE, FILM_BYTES = (400, 225), 300_000
 """Width and height of a small film [pixels], and its largest file."""
 
@@ -78,9 +84,9 @@ def film_failure(source: ReplaySource, name: str, words: str) -> None:
 
 def film_conditions() -> None:
     """Films of the smallest examples of the published searches under conditions."""
-    for kind, robot in FILMED.items():
-        if (least := least_minimum(robot, kind, "conditions")) is not None:
-            source = source_from_run(open_run(robot, Path(f"results/{robot}/conditions")), minimal=str(least["elite"]))
+    for kind, (robot, search) in FILMED.items():
+        if (least := least_minimum(robot, kind, search)) is not None:
+            source = source_from_run(open_run(robot, Path(f"results/{robot}/{search}")), minimal=str(least["elite"]))
             film_failure(source, kind, CONDITIONS[kind].cause)
 
 

@@ -186,12 +186,13 @@ def test_never_more_robots_than_episodes(anymal):
 
 
 def test_a_gpus_robots_run_the_same_episodes(anymal, device):
-    """With the same starts to the bit; what follows differs by rounding, since a GPU adds in any order."""
+    """To the bit on any number of its robots; with the same starts as a CPU's, after which both round differently."""
     cfg = dataclasses.replace(NEAR, poll_every_s=0.1)
-    queued, cpu = (
+    queued, other, cpu = (
         rollout_of(anymal, num_envs, cfg=cfg, device=where, duration_s=0.2).evaluate(on_grids(np.array([0, 2, 4])))
-        for num_envs, where in ((5, device), (None, "cpu"))
+        for num_envs, where in ((5, device), (7, device), (None, "cpu"))
     )
+    check_same(queued, other)
     np.testing.assert_array_equal(queued.outcome, cpu.outcome)
     np.testing.assert_allclose(queued.duration_s, cpu.duration_s, atol=1e-6)
     np.testing.assert_allclose(queued.final_position, cpu.final_position, atol=2e-3)
