@@ -1,5 +1,5 @@
 # The doors of the project. Every target works in .venv, built from pyproject.toml and constraints.txt: `make setup` installs all
-# packages, a target that only searches and shows installs those that this takes.
+# packages, a target that only searches, shows or tests installs those that this takes.
 .DEFAULT_GOAL := help
 .PHONY: help setup archive train finetune harden evaluate report view bench docs pictures test test-all test-gpu lint
 
@@ -10,6 +10,7 @@ TORCH ?=
 BIN := .venv/bin
 EXTRAS := [cluster,dev,menagerie,onnx,train]
 SEARCH := .venv/.search-done
+TEST := .venv/.test-done
 STAMP := .venv/.setup-done
 # The torch that was asked for is kept: a later setup does not put the pinned one back.
 ifneq ($(TORCH),)
@@ -64,9 +65,13 @@ $(SEARCH): pyproject.toml constraints.txt $(ANEW)
 	$(call install)
 	@touch $@
 
+$(TEST): pyproject.toml constraints.txt $(ANEW)
+	$(call install,[onnx,test,train])
+	@touch $(SEARCH) $@
+
 $(STAMP): pyproject.toml constraints.txt $(ANEW)
 	$(call install,$(EXTRAS))
-	@touch $(SEARCH) $@
+	@touch $(SEARCH) $(TEST) $@
 
 archive: $(SEARCH) ## Search the terrains on which a controller fails; writes a run under runs/
 	$(call faultline,archive)
@@ -98,7 +103,7 @@ docs: setup ## Write the tables of README and docs/ anew from the results
 pictures: setup ## Make the pictures of README and docs/ anew: some minutes, a browser
 	$(BIN)/python -m results.make.pictures
 
-test: setup ## Run the quick tests: about three minutes on two cores
+test: $(TEST) ## Run the quick tests: some minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray' $(ARGS)
 
 test-all: setup ## Run all tests: about seven minutes on two cores

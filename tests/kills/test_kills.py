@@ -79,6 +79,7 @@ def formats(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("name", READERS)
+@pytest.mark.slow
 def test_a_damaged_file_is_refused_or_says_what_was_written(formats, tmp_path, name):
     file, expected, num_refused = tmp_path / Path(name).name, READERS[name](formats / name), 0
     assert expected is not None

@@ -53,6 +53,7 @@ def test_both_simulators_agree_whether_a_controller_walks(tmp_path, monkeypatch,
     assert walks == ("kerb" in output) == (goals == 20)
 
 
+@pytest.mark.slow
 def test_a_robot_toml_gets_scales_when_it_is_first_used_and_when_it_changes(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     pose = "default_joint_pos = {'.*hip' = 0.6, '.*knee' = -1.2}\n"

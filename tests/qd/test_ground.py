@@ -52,6 +52,7 @@ def test_a_run_goes_on_with_its_ground_and_exports_it(run):
         ExportCommand(run=run, elite="0", formats=("stl",), overwrite=True).execute()
 
 
+@pytest.mark.slow
 def test_a_minimal_terrain_may_be_a_patch(run):
     archive = read_archive(run).rows(np.arange(1))
     archive.genes[0, 64:96], archive.genes[0, 96:] = -1.0, 1.0  # slippery and soft everywhere

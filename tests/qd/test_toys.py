@@ -63,6 +63,7 @@ def test_figures_show_the_label_of_the_penalty(searched):
     assert "roll rate of\nthe trunk" in [tick.get_text() for axes in figure.axes for tick in axes.get_xticklabels()]
 
 
+@pytest.mark.slow
 def test_a_replay_and_a_report_name_them(searched, capsys):
     flags, run = searched
     with crossing_by(open_here):

@@ -70,6 +70,7 @@ def test_a_repair_is_among_the_changes_of_what_was_planted(dog):
             assert base in [repair.variant for repair in propose_changes(change.variant)], change.text
 
 
+@pytest.mark.slow
 def test_robots_side_by_side_walk_as_each_does_alone(dog):
     base, weights = dog
     stiffer = replace(base, robot=replace(base.robot, stiffness=(120.0,) * 8, damping=(2.0,) * 8))

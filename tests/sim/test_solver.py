@@ -183,6 +183,7 @@ def everything(device, arms=0, height=0.1):
 
 
 @pytest.mark.parametrize(("arms", "height"), [(0, 0.1), (23, 0.1), (31, 0.1), (31, -0.2)])
+@pytest.mark.slow
 def test_every_kind_of_constraint(device, arms, height):
     m, d, contacts = everything(device, arms, height)
     ours = make_ours(m, d, contacts)
@@ -353,6 +354,7 @@ def test_the_slope_of_forces_is_that_of_mujoco_warp(device):
 
 
 @pytest.mark.parametrize("solver", ["Newton", "CG"])
+@pytest.mark.slow
 def test_too_many_contacts_are_noted(device, solver):
     m, d, contacts = build(MODEL, device, option=f'cone="elliptic" solver="{solver}"')
     dynamics = make_ours(m, d, contacts)

@@ -233,6 +233,7 @@ def test_which_elites_are_trained_on(places, searched):
         find_training_elites(ROBOT, cfg_of(places, archive=(str(places / "crossed.npz"),), only="failing"))
 
 
+@pytest.mark.slow
 def test_a_specialist_trains_on_all_that_the_searched_controller_fails(places, searched):
     flags = ["--specialist", str(searched), "--num-envs", "6", "--terrains", "4", "--device", "cpu"]
     small = ["--ppo.steps-per-env", "4", "--ppo.epochs", "1"]

@@ -134,6 +134,7 @@ def test_rounds_from_end_to_end(place, hardened):
     assert all(row == {"base": 0.0, "round-1": 0.5, "round-2": 0.5} for row in goal.values())
 
 
+@pytest.mark.slow
 def test_stopped_it_comes_to_the_same_and_goes_on_for_more_rounds(hardened, place):
     expected = hardened(World(), rounds=1)
     (place / "run").rename(place / "whole")

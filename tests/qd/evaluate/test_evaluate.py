@@ -171,6 +171,7 @@ def test_what_comes_next(candidates, expected):
         assert packs.choose_terrains(candidates, size) == expected[:size]
 
 
+@pytest.mark.slow
 def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     robots, base = Robots(fails), {"base": str(anymal.policy_file)}

@@ -370,6 +370,7 @@ def test_elites_carry_the_certificates_of_their_rows():
     assert generated_set(make_archive(30), 300, 0).certified is None
 
 
+@pytest.mark.slow
 def test_the_far_third_is_the_farthest():
     training = SUPER_GAUSSIAN.hard_random(60, 0)  # more than are compared at once
     genes = SUPER_GAUSSIAN.hard_random(4, 1)

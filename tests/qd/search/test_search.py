@@ -261,6 +261,7 @@ def test_a_search_asks_who_crosses_what_stops_the_robot_and_goes_on_as_if_never_
         assert (tmp_path / str(count) / "archive.npz").read_bytes() == (tmp_path / "whole/archive.npz").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_search_ends_where_its_last_tenth_brings_little(tmp_path, capsys):
     """The same if it is stopped before that is found out, behind it, or while it settles, and goes on."""
     path, settings = tmp_path / "run", {"scheduler": AGAIN, "iterations": 60, "until": 0.05}
@@ -296,6 +297,7 @@ def test_a_search_of_few_iterations_or_without_elites_has_no_last_tenth(tmp_path
     assert "last tenth" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_elites_that_are_crossed_again_are_there_again_more_often(tmp_path):
     """Over robots whose penalties differ by half from episode to episode, at equally many episodes."""
 

@@ -72,6 +72,7 @@ def learned() -> Surrogate:
     return surrogate
 
 
+@pytest.mark.slow
 def test_what_it_learned_holds_for_other_terrains(learned):
     genes = SUPER_GAUSSIAN.hard_random(150, 100)
     truth = crossed(genes, 100)
@@ -86,6 +87,7 @@ def test_what_it_learned_holds_for_other_terrains(learned):
     assert prediction["collided"].mean() < 0.1  # none of the stand-in's robots collides
 
 
+@pytest.mark.slow
 def test_it_learns_from_a_payload_alone():
     """On one terrain for all, penalties follow from the payload."""
     space = get_space("super_gaussian+payload")
@@ -149,6 +151,7 @@ def test_mirrored_terrains_are_seen_as_if_they_lay_so():
     assert not torch.equal(mirrored[0], plain[0])
 
 
+@pytest.mark.slow
 def test_training_is_the_same_on_every_device_and_after_a_pickle(device, monkeypatch):
     """On CUDA: steps before the capture, its repetition, and what was saved after it; back on the CPU at last.
 
@@ -302,6 +305,7 @@ def test_labels_that_nobody_knows_cost_nothing_by_hand():
     assert label_loss(logits, torch.full_like(labels, unknown)).item() == 0.0
 
 
+@pytest.mark.slow
 def test_it_learns_who_crosses_from_a_few_labels_and_keeps_these(monkeypatch):
     """Nobody crosses where a wall of .25 m lies in the middle; the newest 200 terrains are learned from."""
     monkeypatch.setattr(module, "MAX_TERRAINS", 200)

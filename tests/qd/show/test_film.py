@@ -135,6 +135,7 @@ def film(*argv):
     return run_command(FilmCommand, [*argv, "--device", "cpu", "--no-shadows"], name="film")
 
 
+@pytest.mark.slow
 def test_films_of_elites_and_of_a_map(run, opengl, capsys):
     crossing = ("--replicas", "4", "--seed", "3", "--policy", "tests.sim.policies:stand")
     assert film("--elite", "0 2", *crossing) == 0

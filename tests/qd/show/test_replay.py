@@ -102,6 +102,7 @@ def test_corrected_values_stand_between_the_found_ones_and_those_of_now(opened_r
     assert "base collision 25% (5-70%) 25% (13-42%) 25% (5-70%)" in lines
 
 
+@pytest.mark.slow
 def test_rates_of_ones_own_terrain_with_their_intervals():
     gray = np.zeros((81, 161), np.uint8)
     gray[:, 100:] = 200  # a wall of 2 m before the goal

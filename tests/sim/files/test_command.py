@@ -90,6 +90,7 @@ for columns in {WIDTHS}:
 """
 
 
+@pytest.mark.slow
 def test_help_fits_a_terminal_of_any_width_and_says_no_none(capsys, monkeypatch):
     for columns in WIDTHS:
         monkeypatch.setenv("COLUMNS", str(columns))
@@ -123,6 +124,7 @@ def test_a_bug_has_its_traceback_and_so_has_every_error_for_debugging(monkeypatc
 
 
 @pytest.mark.parametrize("flag", ["--how=end", "--how=now", "--help"])
+@pytest.mark.slow
 def test_where_nobody_reads_its_output_any_more_a_command_ends_without_a_word(flag):
     """As in ``faultline ... | head -1``, whether it notices at once or when it ends."""
     read, write = os.pipe()

@@ -192,6 +192,7 @@ def test_lines_have_few_colours_and_maps_all(colours):
 
 
 @pytest.mark.parametrize(("share", "families"), [(0.003, 300), (0.1, 300), (0.5, 6)])
+@pytest.mark.slow
 def test_intervals_of_rates_cover_what_is_rare_and_what_few_families_say(share, families):
     # A share of the terrains stops half of the episodes, the others stop none.
     rng, covered, repetitions = np.random.default_rng(5), 0, 200

@@ -106,6 +106,7 @@ def test_a_foot_at_3_m_per_s_does_not_pass_through_a_step_edge(device, tmp_path)
     assert (deepest[outside] > 0).all(), f"centre inside the ground: {deepest[outside].min()}"
 
 
+@pytest.mark.slow
 def test_a_robot_of_many_joints_rests_on_the_ground_by_mujoco_warps_step(tmp_path, device):
     # One joint follows another, which our step does not know; with more than 32 dofs theirs has a sparse Jacobian.
     robot = free_body(tmp_path, 'type="box" size="0.1 0.1 0.05"', mass=1.0)

@@ -167,6 +167,7 @@ def test_a_push_moves_it_on_the_ground_as_in_mujoco(tmp_path, device, kind):
     np.testing.assert_allclose(sim.joint_q.numpy()[0, 7:], data.qpos[7:], atol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_mimicking_joint_follows_without_a_drive(tmp_path, device):
     knee = '<joint name="FL_knee" type="revolute">'
     assert knee in urdf()

@@ -47,6 +47,7 @@ def test_a_file_is_a_robot(tmp_path, monkeypatch):
     assert get_robot("link.py") == pickle.loads(pickle.dumps(dog)) == dog
 
 
+@pytest.mark.slow
 def test_what_a_robot_toml_leaves_out_is_what_a_user_would_write(tmp_path):
     keys = f'<keyframe><key name="home" qpos="0 0 .3 1 0 0 0{4 * " 0.6 -1.2"}"/></keyframe></mujoco>'
     file = write_toml(tmp_path / "dog", model=mjcf().replace("</mujoco>", keys))
@@ -101,6 +102,7 @@ def test_a_wrong_robot_toml_is_refused(tmp_path, text, named):
     assert "robot.toml" in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_blind_robot_crosses_in_both_simulators(tmp_path, device):
     dog = dataclasses.replace(get_robot(str(write_dog(tmp_path))), scan_x=(), scan_y=())
 

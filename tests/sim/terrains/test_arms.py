@@ -80,6 +80,7 @@ def test_joints_that_the_controller_beside_it_does_not_move_are_those_of_arms(ar
         get_robot(str(write_toml(tmp_path / "bird", 'arm_joints = ["FL_hip", "wing"]')))
 
 
+@pytest.mark.slow
 def test_arms_move_as_in_mujoco_c(armed, device):
     rows = rows_of({}, *CASES.values())
     for ours, plain in fall(armed, rows, (60, 300), device):  # while a shift grows, and after

@@ -76,6 +76,7 @@ def test_scaled_bumps_are_lower_everywhere():
 
 
 @pytest.mark.parametrize("name", ["super_gaussian", "course"])
+@pytest.mark.slow
 def test_a_lower_space_is_the_same_terrain_with_all_heights_scaled(name):
     space, lower = get_space(name), get_space(f"{name}@0.1")
     genes = space.hard_random(3, 0)
@@ -426,6 +427,7 @@ def test_an_element_appears_wherever_elements_do(name):
     assert make_heights(genes, space).any() == (name != "flat")
 
 
+@pytest.mark.slow
 def test_a_toy_condition_blows_the_robot_forward(anymal):
     space, robot = get_space("super_gaussian+wind"), dataclasses.replace(anymal, max_duration_s=0.4)
     genes = np.zeros((2, 65), np.float32)

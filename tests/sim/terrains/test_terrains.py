@@ -182,6 +182,7 @@ def height_in_mujoco_c(robot, ground, z, duration_s):
     return np.array(heights)
 
 
+@pytest.mark.slow
 def test_a_box_slides_on_an_incline_as_its_friction_says(tmp_path, device):
     # At 20 degrees a = g (sin - mu cos), or rest where mu exceeds the tangent, 0.36; the box's own friction is 1.
     # Downhill is half way between x and y, where a pyramid of friction would hold by mu / sqrt(2) alone.

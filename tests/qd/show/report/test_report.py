@@ -200,6 +200,7 @@ def tables():
     return made | {"certified": {"generated": about}}
 
 
+@pytest.mark.slow
 def test_tables_are_shown_where_they_are_asked_for(reported, run, anymal):
     assert "Controllers compared" not in text_of(reported()[0].read_bytes())
     file = run.parent / "tables.json"

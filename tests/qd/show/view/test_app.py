@@ -137,6 +137,7 @@ def test_a_visitor_who_does_not_say_the_size_of_a_window_has_no_tab_yet(shown):
     assert (list(shown.app.tabs.values())[1].selection.picked, shown.tab.selection.picked) == (7, 0)
 
 
+@pytest.mark.slow
 def test_what_one_tab_does_no_other_tab_sees(shown):
     first, second = shown.tab, shown.come("?elite=171&t=3")
     assert first.selection.picked == 0 and second.selection.picked == 171
@@ -197,6 +198,7 @@ def test_a_frame_has_the_robot_in_its_place_what_touches_in_colour_and_forces(sh
     assert pushed[frame].any()
 
 
+@pytest.mark.slow
 def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
     genes = show.archive.genes[0].copy()
     genes[:8] = 0.0
@@ -222,6 +224,7 @@ def test_a_minimal_terrain_is_shown_instead(show, worst_crossed, tmp_path):
         assert notes(shown.clients[2]) == ["Elite 7 has no minimal terrain here."]
 
 
+@pytest.mark.slow
 def test_a_second_controller_crosses_beside_it_as_a_ghost(shown):
     tab = shown.tab
     shown.do((tab.choose_ghost, "none"))

@@ -78,6 +78,7 @@ def test_progress_comes_before_the_recording(recorder, reports):
     assert [report.share for report in last_of(reports)] == [0.5, 1.0]  # it is built once
 
 
+@pytest.mark.slow
 def test_of_several_wishes_the_last_one_counts(recorder, reports):
     begin_slowly(recorder, reports)
     for number in (2, 3, 4):
