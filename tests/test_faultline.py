@@ -32,6 +32,7 @@ def test_help_names_every_command_the_six_of_a_newcomer_first_and_loads_nothing(
 
 
 @pytest.mark.parametrize("name", WORDS)
+@pytest.mark.slow
 def test_a_command_is_a_frozen_dataclass_whose_help_teaches_and_is_quick(name):
     text, loaded = loaded_by(name, "--help")
     assert f"usage: faultline {name}" in text and loaded <= {"warp"}  # which names of conditions take 0.2 s to load

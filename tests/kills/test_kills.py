@@ -27,7 +27,6 @@ from tests.kills import runs
 from tests.kills.faults import fill, run_child
 from train.ppo.checkpoint import read_checkpoint
 
-pytestmark = pytest.mark.usefixtures("nursery")
 SEED = 5
 MUTATIONS = 100
 EXPECTED = (ValueError, FileNotFoundError)
@@ -67,7 +66,7 @@ READERS = {
 
 
 @pytest.fixture(scope="module")
-def formats(tmp_path_factory) -> Path:
+def formats(nursery, tmp_path_factory) -> Path:
     """A folder with a whole file of each format."""
     folder = tmp_path_factory.mktemp("formats")
     assert run_child(folder / "log", runs.train, folder / "training", iterations=1)[0] == 0
@@ -78,8 +77,8 @@ def formats(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", READERS)
 @pytest.mark.slow
+@pytest.mark.parametrize("name", READERS)
 def test_a_damaged_file_is_refused_or_says_what_was_written(formats, tmp_path, name):
     file, expected, num_refused = tmp_path / Path(name).name, READERS[name](formats / name), 0
     assert expected is not None
@@ -170,7 +169,9 @@ def at_last_of_each(steps: list[str], names: tuple[str, ...], disturb: Callable[
         list(pool.map(disturb, last.values(), last))
 
 
-@pytest.mark.parametrize("kind", ["search", pytest.param("training", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.usefixtures("nursery")
+@pytest.mark.parametrize("kind", ["search", "training"])
 def test_a_run_killed_at_a_step_loses_nothing_and_ends_alike(folder, kind):
     run, outcome, saved, checkpoint = KINDS[kind]
     steps, whole = undisturbed(folder, kind)
@@ -189,6 +190,7 @@ def test_a_run_killed_at_a_step_loses_nothing_and_ends_alike(folder, kind):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("nursery")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_disk_that_fills_up_is_said_in_a_line_and_the_run_goes_on_once_there_is_space(folder, kind):
     run, outcome, *_ = KINDS[kind]

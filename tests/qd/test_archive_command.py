@@ -117,6 +117,7 @@ def test_what_nobody_crosses_earns_less_by_itself_where_that_can_be_learned_and_
     assert archive("--resume", "a", *MORE, "2") == 0  # 0 is the default of this run now
 
 
+@pytest.mark.slow
 def test_likely_conditions_are_preferred_by_a_model_that_the_run_remembers(capsys):
     likely = [*TINY, "--fitness.crossed", "0", "--fitness.likely", "0.5"]
     assert "fitness.likely" in fails(capsys, *likely, "--space", "super_gaussian+push")

@@ -24,6 +24,7 @@ from tests.sim.dogs import CONTROLLER, write_dog, write_toml
 ROBOT = get_robot("anymal")
 
 
+@pytest.mark.slow
 def test_the_command_prints_what_is_read_and_fails_where_something_must_be_mended(tmp_path, capsys):
     file = write_dog(tmp_path)
     file.write_text(file.read_text().replace("default_base_height=0.29", "default_base_height=0.2, nconmax=2"))

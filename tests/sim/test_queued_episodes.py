@@ -163,6 +163,7 @@ class CountsTogether(CountsByRow):
         return super().__call__(row)
 
 
+@pytest.mark.slow
 def test_a_policy_that_remembers_begins_every_episode_anew(anymal):
     short = {"cfg": FAR, "duration_s": 1.0}
     expected = rollout_of(anymal, None, CountsTogether(), **short).evaluate(on_grids(slice(5)))

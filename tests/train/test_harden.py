@@ -153,6 +153,7 @@ def test_stopped_it_comes_to_the_same_and_goes_on_for_more_rounds(hardened, plac
         hardened(World(), rounds=1)
 
 
+@pytest.mark.slow
 def test_a_training_that_makes_it_worse_is_not_kept(hardened, place):
     world, run = World("tune-2"), place / "run"
     content = hardened(world, rounds=3)

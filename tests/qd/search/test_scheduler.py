@@ -57,7 +57,7 @@ def test_the_best_of_a_cell_is_kept_and_a_worse_one_never_replaces_it():
     assert np.array_equal(elites["genes"][0], genes[0])
 
 
-@pytest.mark.parametrize("again", [0, 5])
+@pytest.mark.parametrize("again", [pytest.param(0, marks=pytest.mark.slow), 5])
 @pytest.mark.parametrize("method", [*METHODS, *JOINED, "cma_mae+map_elites", "cma_mae+map_elites+surrogate"])
 def test_a_saved_search_goes_on_bit_for_bit(method, again, tmp_path):
     # 16 iterations: several eigendecompositions and restarts lie on both sides of the cut

@@ -235,6 +235,7 @@ def partly_late(cfg, genes, seeds):
     return stand_in.make_result(penalties, late=np.repeat(~passes[:, None], cfg.replicas, axis=1))
 
 
+@pytest.mark.slow
 def test_a_search_asks_who_crosses_what_stops_the_robot_and_goes_on_as_if_never_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(labels, "MOST", 6)
     monkeypatch.setattr(surrogate, "BATCH", 4)

@@ -51,6 +51,7 @@ def gaps(sim, grids):
     return gap
 
 
+@pytest.mark.slow
 def test_fallen_robots_lie_on_the_surface_and_nothing_overflows(robot, device):
     # Hard-random gene terrains and every hand-crafted kind at its hardest.
     hand_crafted = [crossing_terrain(kind, 9, 22) for kind in CROSSING_TYPES]

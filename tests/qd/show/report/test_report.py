@@ -48,6 +48,7 @@ def whole(tmp_path_factory):
         return reporter(make_run(tmp_path_factory.mktemp("whole")), patch)(num_elites=2)
 
 
+@pytest.mark.slow
 def test_the_page_is_whole_and_fetches_nothing(whole):
     out, crossed = whole
     content = out.read_text()
@@ -61,6 +62,7 @@ def test_the_page_is_whole_and_fetches_nothing(whole):
     assert len(images) == 1 + len(crossed) + 2 + 2 and len(crossed) == len(set(crossed))
 
 
+@pytest.mark.slow
 def test_the_page_begins_with_the_sentence_and_has_the_numbers_of_the_files(whole):
     content, archive = whole[0].read_text(), read_archive(whole[0].parent)
     ranking, text = rank(archive, SUPER_GAUSSIAN, half_width=0.4, judged=True), text_of(content.encode())
