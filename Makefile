@@ -9,6 +9,7 @@ ARGS ?=
 TORCH ?=
 BIN := .venv/bin
 EXTRAS := [cluster,dev,menagerie,onnx,train]
+TEST_EXTRAS := [onnx,test,train]
 SEARCH := .venv/.search-done
 TEST := .venv/.test-done
 STAMP := .venv/.setup-done
@@ -66,7 +67,7 @@ $(SEARCH): pyproject.toml constraints.txt $(ANEW)
 	@touch $@
 
 $(TEST): pyproject.toml constraints.txt $(ANEW)
-	$(call install,[onnx,test,train])
+	$(call install,$(TEST_EXTRAS))
 	@touch $(SEARCH) $@
 
 $(STAMP): pyproject.toml constraints.txt $(ANEW)
