@@ -587,7 +587,6 @@ def speed() -> str:
         }
     mixed = "cma_mae+map_elites"
     million = {"form": ".1f", "factor": 1e-6}
-    minutes = {"form": ".1f", "factor": 1 / 60}
     columns: dict[str, Column] = {
         **{f"episodes/s of {count:,} robots": shown("envs_curve", count, "episodes_per_s")
            for count in (1024, 4096, 32768)},
@@ -603,7 +602,6 @@ def speed() -> str:
             shown("wide", "surrogate", "minutes_per_4m_episodes", form=".1f"),
         f"... by `{mixed}` [s]": shown("wide", mixed, "iteration_s_median", form=".1f"),
         f"... minutes by `{mixed}`": shown("wide", mixed, "minutes_per_4m_episodes", form=".1f"),
-        "preset small on a CPU [minutes]": shown("cpu", "archive_wall_s", **minutes),
         **{f"{count:,} robots standing: {alone}physics steps/s [million]":
            shown("flat", count, f"world_steps_per_s{key}", **million)
            for count in (4096, 32768) for alone, key in (("", ""), ("mujoco_warp's ", "_mujoco_warp"))},

@@ -4,31 +4,24 @@ The timed iterations are those of a real search, from ask to the saved checkpoin
 on the terrains that the search asks for next, with the same number of robots and the same solver. Steps are counted for
 robots in an episode; waiting robots are not computed.
 
-On a GPU it measures everything but ``cpu``, which it measures on a CPU. Each keeps the numbers of the other. With
-``--against`` it measures nothing but searches of this checkout and of another one in turns, which takes 6 minutes.
+With ``--against`` it measures nothing but searches of this checkout and of another one in turns, which takes 6 minutes.
 """
 
 import json
 import os
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
-from qd.search.archive import read_archive
 from qd.search.directory import Metrics, RunDirectory
-from qd.search.fitness import FAILING_GOAL_RATE
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, preset
 from qd.workers.compute import Compute
@@ -52,7 +45,7 @@ ITERATION_KEYS = ("iteration_s_median", "bare_physics_ratio", "world_steps_per_s
 UNDER = ("conditions", "all_conditions", "route")
 """Bare rates that say what conditions cost."""
 RATIOS = tuple(f"{name}_step_ratio" for name in UNDER)
-KEYS = (*ITERATION_KEYS, *RATIOS, "against", "envs_curve", "wide", "flat", "kernels", "cpu")
+KEYS = (*ITERATION_KEYS, *RATIOS, "against", "envs_curve", "wide", "flat", "kernels")
 """Keys that readers expect: null until measured."""
 ROUNDS, TIMED = 4, 8
 """Searches of each checkout that are timed in turns, and iterations of each."""
@@ -189,58 +182,6 @@ def time_kernels(script: Script) -> dict[str, Any]:
     return {"kernels_num_envs": PROFILED, "kernels": shares}
 
 
-def time_cpu(script: Script) -> dict[str, Any]:
-    """Time of the whole archive command of preset small on a CPU, with compiled kernels."""
-    run = script.runs / "speed" / "cpu"
-    kernels = Path(str(wp.config.kernel_cache_dir))
-    command = ("archive", "--robot", script.robot.name, "--preset", "small", "--device", "cpu", "--run-dir", str(run))
-    for _ in range(2):
-        shutil.rmtree(run, ignore_errors=True)
-        compiled = set(kernels.iterdir())
-        began = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "faultline", *command], check=True)
-        wall_s = time.perf_counter() - began
-        if compiled == set(kernels.iterdir()):
-            break  # else the first run compiled kernels
-    view = time_view(script.robot.name, script.runs / "speed")
-    archive = read_archive(run)
-    counts = {"elites": len(archive), "failing_as_found": int((archive.goal_rate < FAILING_GOAL_RATE).sum())}
-    return {"cpu": {**script.origin, "archive_wall_s": wall_s, **counts, **view}}
-
-
-def time_view(robot: str, folder: Path) -> dict[str, float | None]:
-    """Times from `faultline view` to the page and to a playing failure, with compiled kernels.
-
-    The archive is the published one, without stored recordings; a headless browser opens the page.
-    """
-    browser_file = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser_file is None or find_spec("playwright") is None:
-        return {"view_to_page_s": None, "view_to_failure_s": None}
-    from playwright.sync_api import sync_playwright
-
-    cache = folder / "recordings"
-    shutil.rmtree(cache, ignore_errors=True)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    command = [sys.executable, "-m", "faultline", "view", "--run", f"results/{robot}/archive", "--port", port]
-    command += ["--cache", str(cache)]
-    with sync_playwright() as started:
-        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        page = started.chromium.launch(executable_path=browser_file, args=flags).new_page()
-        began = time.perf_counter()
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-            assert server.stdout is not None
-            next(line for line in server.stdout if line.startswith("Open "))
-            served_s = time.perf_counter() - began
-            page.goto(f"http://127.0.0.1:{port}")
-            page.wait_for_function("document.querySelector('#faultline [aria-label=Pause]')", timeout=300_000)
-            plays_s = time.perf_counter() - began
-            server.terminate()
-            server.communicate()
-    return {"view_to_page_s": served_s, "view_to_failure_s": plays_s}
-
-
 def training_rates(script: Script, device: str) -> dict[str, Any]:
     """PPO's environment steps a second with learning on a device, from train_speed.json of today's sources.
 
@@ -265,11 +206,10 @@ IN_TRIAL = ("curve", "iteration", "flat")
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Measures all that the device can, beside the numbers of the other kind of device."""
+    """Measures all, or the parts that are named beside what is there."""
     help_against = "folder of another checkout, whose searches alone are measured beside this one's"
     script = parse(__doc__, argv, "speed.json", parts=tuple(ON_GPU), against=help_against)
-    on_cpu = script.device == "cpu" and not script.small
-    parts = {"cpu": time_cpu} if on_cpu else ON_GPU
+    parts = ON_GPU
     if script.against is not None:
         parts = {"against": time_against}
     elif script.parts or script.small:
@@ -280,9 +220,8 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     stored = script.read_so_far(script.out)
     origin = {name: script.origin[name] for name in ("commit", "device", "date")}
     measured = stored.get("measured", {}) | {name: origin for name in parts}
-    report: dict[str, Any] = script.origin | stored if on_cpu else stored | script.origin
-    report = dict.fromkeys(KEYS) | report | numbers | {"measured": measured}
-    return script.add(report, training_rates(script, report["device"]))
+    report: dict[str, Any] = dict.fromkeys(KEYS) | stored | script.origin | numbers | {"measured": measured}
+    return script.add(report, training_rates(script, script.origin["device"]))
 
 
 if __name__ == "__main__":
