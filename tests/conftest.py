@@ -15,8 +15,8 @@ from sim.files.provenance import provenance
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Loads the fixtures, which takes seconds, where tests run: not in a process that only hands them out."""
-    if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
+    """Loads the fixtures, which takes seconds, where tests run or are listed: not in a process that hands them out."""
+    if hasattr(config, "workerinput") or config.option.collectonly or not config.getoption("numprocesses", None):
         config.pluginmanager.import_plugin("tests.fixtures")
 
 

@@ -25,7 +25,7 @@ from qd.faults.families import VERDICTS, find_families, find_verdicts, kin_dista
 from qd.faults.numbers import EPISODES, SPECIALIST, fresh_counts, judgement, rate_numbers, read_minimal
 from qd.faults.searches import Search, find_certifiers
 from qd.search.archive import Archive
-from qd.search.directory import RUNS
+from qd.search.directory import RUNS, SUMMARY_FILE
 from qd.search.fitness import FAILING_GOAL_RATE
 from qd.workers.compute import Compute, check_policy
 from sim.controllers.spec import controller_identity, crosser_name, describe_controllers, is_same_controller
@@ -47,6 +47,15 @@ NEAR_GOAL_RATE = 0.75  # goal rate of the searched controller from which on a te
 _MAX_BYTES = 1e9  # of an array that is read
 _COUNTED = {"failing": "terrains", "failing_families": "families"}  # parts of a pack and the whole
 _SPREAD_OVER = ("family", "cause", "kind")
+_OF_RUN = (
+    "command",
+    "commit",
+    "sources_sha256",
+    "device",
+    "versions",
+    "date",
+    "episodes",
+)  # kept of each run
 _KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
 
 Entry = dict[str, Any]  # what a pack says of one terrain, as JSON values; rates by controller
@@ -313,6 +322,7 @@ def make_pack(
             "runs": [
                 {"run": one.run.name, "seed": one.cfg.seed, "iterations": archive.iterations}
                 | {"elites": len(archive), "elites_sha256": elites_sha256(archive)}
+                | {name: value for name, value in read_json(one.run / SUMMARY_FILE).items() if name in _OF_RUN}
                 for one, archive in zip(searches, archives, strict=True)
             ],
             "apart_from": [elites_sha256(archive) for archive in apart_from],

@@ -42,7 +42,7 @@ class Compute:
     workers: str | None = None
     """Who crosses them, as :func:`parse_workers` takes it; a GPU without Ray needs one process."""
     num_envs: int | None = None
-    """Robots at once over all workers, which changes no result; as many as the device is good for if None."""
+    """Robots at once over all workers, as many as suit the device if None: no result but rounding on a GPU changes."""
 
     @classmethod
     def resolve(cls, device: str | None = None, workers: str | None = None, num_envs: int | None = None) -> Self:

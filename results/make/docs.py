@@ -537,7 +537,7 @@ def league_routes() -> str:
     """Searches of routes against public controllers."""
     columns: dict[str, Column] = {
         "space": lambda row: row["space"],
-        "off the route by [m]": shown("stray_m", form=".2f"),
+        "strays beyond [m]": shown("stray_m", form=".2f"),
     }
     names = ("episodes", "elites", "failing", "failing_distinct", "failing_families", "confirmed")
     columns |= {label: shown("archive", name) for label, name in counts(*names).items()}

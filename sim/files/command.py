@@ -65,7 +65,7 @@ class WorkerFlags(DeviceFlag):
     cluster, or ray:N for N of them. RAY_ADDRESS names a running cluster."""
     num_envs: PositiveInt | None = None
     """How many robots walk at once, over all workers. Each takes one episode after another. If left out, as many as
-    suit the device. It changes how long the work takes, and no result."""
+    suit the device. It changes how long the work takes, and no result but by rounding on a GPU."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,11 @@
 """No figures of searches, and fixtures of the commands that work on a run."""
 
+import tests.imports
+
+# isort: split
+import tests.toys  # noqa: F401  before anything reads the registries
+
+# isort: split
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -354,7 +354,6 @@ def test_the_slope_of_forces_is_that_of_mujoco_warp(device):
 
 
 @pytest.mark.parametrize("solver", ["Newton", "CG"])
-@pytest.mark.slow
 def test_too_many_contacts_are_noted(device, solver):
     m, d, contacts = build(MODEL, device, option=f'cone="elliptic" solver="{solver}"')
     dynamics = make_ours(m, d, contacts)

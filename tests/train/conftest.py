@@ -1,5 +1,11 @@
 """One small task for all tests of the room, and controllers that a fine-tuning begins with."""
 
+import tests.imports
+
+# isort: split
+import tests.toys  # noqa: F401  before anything reads the registries
+
+# isort: split
 import itertools
 import json
 from collections.abc import Callable

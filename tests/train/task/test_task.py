@@ -110,7 +110,6 @@ def rollout(task: CommandTask, steps: int) -> tuple[np.ndarray, ...]:
     return tuple(torch.stack(part).cpu().numpy() for part in zip(*rows, strict=True))
 
 
-@pytest.mark.slow
 def test_same_seed_same_numbers(make_task):
     task, same = make_task(seed=5), make_task(seed=5)
     numbers, again = rollout(task, 60), rollout(same, 60)
