@@ -47,15 +47,8 @@ NEAR_GOAL_RATE = 0.75  # goal rate of the searched controller from which on a te
 _MAX_BYTES = 1e9  # of an array that is read
 _COUNTED = {"failing": "terrains", "failing_families": "families"}  # parts of a pack and the whole
 _SPREAD_OVER = ("family", "cause", "kind")
-_OF_RUN = (
-    "command",
-    "commit",
-    "sources_sha256",
-    "device",
-    "versions",
-    "date",
-    "episodes",
-)  # kept of each run
+# What a pack keeps of where each of its runs was made.
+_OF_RUN = ("command", "commit", "sources_sha256", "device", "versions", "date", "episodes")
 _KEYS = ("robot", "robot_sha256", "penalty_definition", "terrains", "rates", "terrains_sha256", "seed", "episodes")
 
 Entry = dict[str, Any]  # what a pack says of one terrain, as JSON values; rates by controller
