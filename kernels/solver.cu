@@ -18,10 +18,10 @@ using Vec2 = wp::vec_t<2, float>;
 using Vec5 = wp::vec_t<5, float>;
 float* inertia = memory;  // NV x NV, rows LD apart as all are
 float* vector = inertia + NV * LD;  // operand of products, one number a dof
-float* part = vector + LD;  // CHUNK x DIM x NV; also four rows in a factorisation
-float* coefficient = part + CHUNK * DIM * LD;  // CHUNK x DIM x DIM
+float* part = vector + LD;  // CHUNK x DIM x NV; also rows of a factorisation
+float* coefficient = part + $part_rows * LD;  // CHUNK x DIM x DIM
 Contact* shared_contacts = (Contact*)(coefficient + (CHUNK * DIM * DIM + 3) / 4 * 4);
-constexpr int NUM_FLOATS = (NV + 1 + CHUNK * DIM) * LD + (CHUNK * DIM * DIM + 3) / 4 * 4 + NUM_SHARED * sizeof(Contact) / 4;
+constexpr int NUM_FLOATS = (NV + 1 + $part_rows) * LD + (CHUNK * DIM * DIM + 3) / 4 * 4 + NUM_SHARED * sizeof(Contact) / 4;
 static_assert(NUM_FLOATS == $num_floats, "kernels/solver.py counts memory otherwise");
 Contact* spilled_contacts = (Contact*)&wp::index(problem.spilled_contacts, world, 0);
 auto get_contact = [&](int c) -> Contact& { return c < NUM_SHARED ? shared_contacts[c] : spilled_contacts[c - NUM_SHARED]; };
@@ -149,90 +149,123 @@ auto update_forces = [&]() {
     }
 };
 
-// Solves h x = y in place by L D L^T; h is overwritten. Each lane holds its rows. Pivot rows go through shared memory: h is
-// symmetric, so each lane writes one number of each. Loops of a warp need constant bounds to be unrolled, and take two columns at
-// once: a warp waits for its memory half as often. Nobody reads finished numbers of a row again, but those right of its pivot.
+// Solves h x = y in place by L^T D L; h is overwritten. Each lane holds its rows. The ground touches one branch of a robot's
+// tree at a time, so that h is as sparse as the inertia: a dof changes its ancestors alone (Featherstone, "Rigid Body Dynamics
+// Algorithms", 6.4), and branches are worked on side by side. From the leaves on a step eliminates ends of branches, or ends and
+// their parents (kernels/solver.py, `order_elimination`): a warp waits for its memory once a step. Rows of pivots go through shared
+// memory: h is symmetric, so each lane writes one number of each. Loops of a warp need constant bounds to be unrolled.
+constexpr int STEPS = $steps, CHAINS = $chains, PARENT[] = {$parents};
+constexpr int STEP[] = {$step}, END[] = {$ends}, NEXT[] = {$nexts}, ROW[] = {$rows};
+constexpr bool IS_LEAF[] = {$leaves}, IS_ABOVE[][NV] = {$above};
 auto solve = [&](LaneRows& h, LaneVector& y) {
     float inverse[PER_LANE];
     if (LANES == 1) {
-        for (int k = 0; k < NV; ++k) {
-            float* row = part + k % 2 * LD;
-            for (int i = k; i < NV; ++i) row[i] = h[i][k];
-            inverse[k] = 1.0f / row[k];
-            for (int i = k + 1; i < NV; ++i) {
-                const float below = h[i][k] * inverse[k];
-                y[i] -= below * y[k];
-                for (int j = k / 4 * 4; j < NV; j += 4) {
-                    if (j + 3 <= k) continue;
-                    const Float4 four = *(const Float4*)(row + j);
-                    for (int n = 0; n < 4; ++n) h[i][j + n] -= below * four.v[n];
+        for (int k = NV - 1; k >= 0; --k) {
+            inverse[k] = 1.0f / h[k][k];
+            for (int i = PARENT[k]; i >= 0; i = PARENT[i]) {
+                const float share = h[k][i] * inverse[k];
+                y[i] -= share * y[k];
+                for (int j = 0; j <= i; j += 4) {
+                    const Float4 four = *(const Float4*)(h[k] + j);
+                    for (int n = 0; n < 4; ++n) h[i][j + n] -= share * four.v[n];
                 }
             }
         }
-        for (int k = NV - 1; k >= 0; --k) {
+        for (int k = 0; k < NV; ++k) {
+            for (int i = PARENT[k]; i >= 0; i = PARENT[i]) y[k] -= h[k][i] * y[i];
             y[k] *= inverse[k];
-            for (int i = 0; i < k; ++i) y[i] -= h[i][k] * y[k];
         }
         return;
     }
-    sync();  // the last pair of a former call may be read still
+    bool open[PER_LANE];  // not eliminated; in the second half, not solved
     #pragma unroll
-    for (int k = 0; k < NV - 1; k += 2) {
-        float *row = part + k / 2 % 2 * 2 * LD, *next = row + LD;  // two pairs in turn: slow lanes may still read the other
+    for (int m = 0; m < PER_LANE; ++m) open[m] = true;
+    sync();  // the last rows of a former call may be read still
+    #pragma unroll
+    for (int s = 0; s < STEPS; ++s) {
         #pragma unroll
-        for (int m = 0; m < PER_LANE; ++m) {
-            if (lane + m * LANES < NV) {
-                row[lane + m * LANES] = h[m][k];
-                next[lane + m * LANES] = h[m][k + 1];
+        for (int c = 0; c < CHAINS; ++c) {
+            if (STEP[c] != s) continue;
+            #pragma unroll
+            for (int m = 0; m < PER_LANE; ++m) {
+                const int i = lane + m * LANES;
+                if (i >= NV) continue;
+                part[ROW[c] * LD + i] = h[m][END[c]];
+                if (NEXT[c] >= 0) part[(ROW[c] + 1) * LD + i] = h[m][NEXT[c]];
             }
         }
-        sync();
-        const float beside = row[k + 1], pivot = 1.0f / row[k], share = beside * pivot;
-        const float next_pivot = 1.0f / (next[k + 1] - share * beside), y_k = shuffle(y[k / LANES], k % LANES);
-        const float y_next = shuffle(y[(k + 1) / LANES], (k + 1) % LANES) - share * y_k;
+        float of_end[CHAINS], of_next[CHAINS];  // first of all branches, so that none waits for another
         #pragma unroll
-        for (int m = 0; m < PER_LANE; ++m) {
-            const int i = lane + m * LANES;
-            if (i == k) inverse[m] = pivot;
-            if (i == k + 1) inverse[m] = next_pivot;
-            const float below = i > k ? h[m][k] * pivot : 0.0f;
-            const float below_next = i > k + 1 ? (h[m][k + 1] - below * beside) * next_pivot : 0.0f;
-            const float of_row = below - below_next * share;
-            y[m] -= below * y_k + below_next * y_next;
+        for (int c = 0; c < CHAINS; ++c) {
+            if (STEP[c] != s) continue;
+            of_end[c] = shuffle(y[END[c] / LANES], END[c] % LANES);
+            of_next[c] = NEXT[c] < 0 ? 0.0f : shuffle(y[NEXT[c] / LANES], NEXT[c] % LANES);
+        }
+        sync();
+        #pragma unroll
+        for (int c = 0; c < CHAINS; ++c) {
+            if (STEP[c] != s) continue;
+            const int k = END[c], next_k = NEXT[c], last = next_k < 0 ? k : next_k;
+            const float *row = part + ROW[c] * LD, *next = row + LD;
+            const float pivot = 1.0f / row[k], y_k = of_end[c];
+            float beside = 0.0f, share = 0.0f, next_pivot = 0.0f;
+            if (next_k >= 0) {
+                beside = row[next_k];
+                share = beside * pivot;
+                next_pivot = 1.0f / (next[next_k] - share * beside);
+            }
+            const float y_next = of_next[c] - share * y_k;
             #pragma unroll
-            for (int j = 0; j < NV; j += 4) {
-                if (j + 3 <= k + 1) continue;
-                const Float4 four = *(const Float4*)(row + j), next_four = *(const Float4*)(next + j);
+            for (int m = 0; m < PER_LANE; ++m) {
+                const int i = lane + m * LANES;
+                if (i == k) inverse[m] = pivot;
+                if (i == next_k) inverse[m] = next_pivot;
+                const float below = open[m] && i != k ? h[m][k] * pivot : 0.0f;
+                open[m] = open[m] && i != k && i != next_k;
+                const float below_next = open[m] && next_k >= 0 ? (h[m][last] - below * beside) * next_pivot : 0.0f;
+                const float of_row = below - below_next * share;
+                y[m] -= below * y_k + below_next * y_next;
                 #pragma unroll
-                for (int n = 0; n < 4; ++n) {
-                    if (j + n > k + 1 && j + n < NV) h[m][j + n] -= of_row * four.v[n] + below_next * next_four.v[n];
+                for (int j = 0; j < NV; j += 4) {
+                    bool any = false;
+                    #pragma unroll
+                    for (int n = 0; n < 4; ++n) any = any || (j + n < NV && IS_ABOVE[last][j + n]);
+                    if (!any) continue;
+                    const Float4 four = *(const Float4*)(row + j), next_four = next_k < 0 ? four : *(const Float4*)(next + j);
+                    #pragma unroll
+                    for (int n = 0; n < 4; ++n) {
+                        if (j + n < NV && IS_ABOVE[last][j + n]) h[m][j + n] -= of_row * four.v[n] + below_next * next_four.v[n];
+                    }
                 }
             }
         }
     }
-    constexpr int LAST = NV - 1;
-    if (NV % 2 == 1) {
-        float x = 0.0f;
+    #pragma unroll
+    for (int m = 0; m < PER_LANE; ++m) open[m] = true;
+    #pragma unroll
+    for (int s = 2 * STEPS - 1; s >= 0; --s) {  // from the roots on: in each step parents, then ends
+        const int* of_step = s % 2 == 1 ? NEXT : END;
+        float x[CHAINS];
         #pragma unroll
-        for (int m = 0; m < PER_LANE; ++m) {
-            if (lane + m * LANES == LAST) x = y[m] / h[m][LAST];
+        for (int c = 0; c < CHAINS; ++c) {
+            if (STEP[c] != s / 2) continue;
+            const int k = wp::max(of_step[c], 0);
+            x[c] = shuffle(y[k / LANES] * inverse[k / LANES], k % LANES);
         }
-        x = shuffle(x, LAST % LANES);
         #pragma unroll
-        for (int m = 0; m < PER_LANE; ++m) y[m] = lane + m * LANES == LAST ? x : y[m] - h[m][LAST] * x;
+        for (int c = 0; c < CHAINS; ++c) {
+            if (STEP[c] != s / 2) continue;
+            const int k = of_step[c];
+            if (k < 0 || IS_LEAF[k]) continue;
+            #pragma unroll
+            for (int m = 0; m < PER_LANE; ++m) {
+                open[m] = open[m] && lane + m * LANES != k;
+                if (open[m]) y[m] -= h[m][k] * x[c];
+            }
+        }
     }
     #pragma unroll
-    for (int k = LAST - NV % 2; k > 0; k -= 2) {
-        const float x = shuffle(y[k / LANES] * inverse[k / LANES], k % LANES);
-        const float above = shuffle(h[(k - 1) / LANES][k], (k - 1) % LANES), y_above = shuffle(y[(k - 1) / LANES], (k - 1) % LANES);
-        const float x_above = (y_above - above * x) * shuffle(inverse[(k - 1) / LANES], (k - 1) % LANES);
-        #pragma unroll
-        for (int m = 0; m < PER_LANE; ++m) {
-            const int i = lane + m * LANES;
-            const float left = y[m] - h[m][k] * x - h[m][k - 1] * x_above;
-            y[m] = i == k ? x : i == k - 1 ? x_above : i < k ? left : y[m];
-        }
-    }
+    for (int m = 0; m < PER_LANE; ++m) y[m] *= inverse[m];
 };
 
 // Adds the contacts' part of the Hessian to the rows of h.

@@ -12,11 +12,13 @@ semidefinite, so that J^T C J is a sum of squares of combinations of the contact
 """
 
 import math
+from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from kernels.contact import Contacts, Surfaces, vec5
@@ -75,13 +77,61 @@ class Problem:
 class Sizes:
     """Sizes of a model, which its kernel is compiled for."""
 
-    dofs: int
+    parents: tuple[int, ...]
+    """Of each degree of freedom the one before it on its branch, or -1."""
     dimensions: int
     """Rows of the largest contact."""
     inertia: int
     """Stored entries of the inertia."""
     losses: bool
     """Whether there is friction in any joint."""
+
+    @property
+    def dofs(self) -> int:
+        """Degrees of freedom."""
+        return len(self.parents)
+
+    @property
+    def elimination(self) -> list[list[tuple[int, int]]]:
+        """Steps of a factorisation: ends of branches, each with its parent where no other branch is left on that, or -1."""
+        steps, left = [], set(range(self.dofs))
+        while left:
+            on = Counter(self.parents[k] for k in left)
+            ends = sorted(k for k in left if k not in on)
+            parents = [self.parents[k] if on[self.parents[k]] == 1 else -1 for k in ends]
+            steps.append([*zip(ends, parents, strict=True)])
+            left -= {*ends, *parents}
+        return steps
+
+    @property
+    def part_rows(self) -> int:
+        """Rows for a chunk of contacts, or for two steps of a factorisation in turn."""
+        return max(_CHUNK * self.dimensions, *(end for _, end in self._place_rows()))
+
+    def _place_rows(self) -> list[tuple[int, int]]:
+        """First row and end of the rows of each branch in turn: no step has those of the step before it."""
+        sizes = [[1 + (parent >= 0) for _, parent in step] for step in self.elimination]
+        begins = 0, max(map(sum, sizes[::2]))
+        ends = [begins[s % 2] + np.cumsum(step) for s, step in enumerate(sizes)]
+        return [(end - size, end) for step, of_step in zip(sizes, ends, strict=True) for size, end in zip(step, of_step)]
+
+    def describe_elimination(self) -> dict[str, Any]:
+        """:attr:`elimination` as solver.cu has it, with the rows that a step writes, and who is above whom."""
+        steps = self.elimination
+        above = []
+        for parent in self.parents:
+            above.append([int(j == parent or (parent >= 0 and above[parent][j])) for j in range(self.dofs)])
+        ends, nexts = zip(*(chain for step in steps for chain in step), strict=True)
+        lists = {
+            "parents": self.parents,
+            "step": [s for s, step in enumerate(steps) for _ in step],
+            "ends": ends,
+            "nexts": nexts,
+            "rows": [first for first, _ in self._place_rows()],
+            "leaves": [int(k not in self.parents) for k in range(self.dofs)],
+            "above": ["{" + ", ".join(map(str, row)) + "}" for row in above],
+        }
+        return {"steps": len(steps), "chains": len(ends)} | {name: ", ".join(map(str, values)) for name, values in lists.items()}
 
     @property
     def stride(self) -> int:
@@ -94,7 +144,7 @@ class Sizes:
 
     @property
     def _matrix_floats(self) -> int:
-        rows = self.dofs + 1 + _CHUNK * self.dimensions
+        rows = self.dofs + 1 + self.part_rows
         return rows * self.stride + 4 * math.ceil(_CHUNK * self.dimensions**2 / 4)
 
     @property
@@ -116,7 +166,8 @@ class Sizes:
 @cache
 def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
     values = asdict(sizes) | dict(codes) | {"losses": str(sizes.losses).lower()}
-    values |= {"chunk": _CHUNK, "num_shared": sizes.shared_contacts, "stride": sizes.stride}
+    values |= {"chunk": _CHUNK, "num_shared": sizes.shared_contacts, "stride": sizes.stride, "dofs": sizes.dofs}
+    values |= {"part_rows": sizes.part_rows} | sizes.describe_elimination()
     snippet = fill_snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **values)
 
     @wp.func_native(snippet=snippet)

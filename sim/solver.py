@@ -251,7 +251,7 @@ def make_dynamics(
     surfaces = mix_surfaces(m, geoms, ground)
     tree = TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(_levels(m)[1]) - 1)
     sizes = Sizes(
-        dofs=m.nv,
+        parents=tuple(m.dof_parentid.numpy().tolist()),
         dimensions=max(3, int(m.nmaxcondim)),
         inertia=m.M_colind.shape[0],
         losses=bool((m.dof_frictionloss.numpy() > 0.0).any()),
