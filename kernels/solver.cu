@@ -564,27 +564,68 @@ auto search_line = [&](const LaneVector& mv, float search_dot, float scale, floa
     return false;
 };
 
-// Read inertia, joint limits, joint friction and contacts.
+// Read inertia, joint limits, joint friction and contacts. What lies far away is asked for first and waited for once.
+constexpr int NUM_ENTRIES = $inertia, AT_ONCE = LANES == 1 ? 1 : (NUM_ENTRIES + LANES - 1) / LANES;
+constexpr int PER_ROW = (LD + LANES - 1) / LANES;
+struct Found {  // a contact, as the lane reads it that has its slot
+    int slot, shape, rank;
+    float factor, soft, distance;
+    Vec normal, point;
+};
+float entries[AT_ONCE], speed[PER_LANE], trace = 0.0f;
+int rows[AT_ONCE], columns[AT_ONCE];
+Vec turning[PER_LANE], moving[PER_LANE];  // of a dof
+auto read_entries = [&](int begin) {
+    #pragma unroll
+    for (int k = 0; k < AT_ONCE; ++k) {
+        const int m = wp::min(begin + lane + k * LANES, NUM_ENTRIES - 1);
+        entries[k] = wp::index(robots.M, world, m);
+        rows[k] = problem.M_hinit_i.data[m];
+        columns[k] = problem.M_colind.data[m];
+    }
+};
+auto read_found = [&](int begin) {
+    const int slot = wp::max(wp::min(begin + lane, num_contacts - 1), 0);
+    return Found{
+        slot, wp::index(problem.contacts.shape, world, slot), wp::index(problem.contacts.rank, world, slot),
+        wp::index(problem.contacts.friction, world, slot), wp::index(problem.contacts.time_constant, world, slot),
+        wp::index(problem.contacts.distance, world, slot), wp::index(problem.contacts.normal, world, slot),
+        wp::index(problem.contacts.point, world, slot)};
+};
+#pragma unroll ALL
+for (int m = 0; m < PER_LANE; ++m) {
+    const int i = wp::min(lane + m * LANES, NV - 1);
+    qacc[m] = wp::index(problem.qacc_warmstart, world, i);
+    smooth[m] = wp::index(robots.qfrc_smooth, world, i);
+    speed[m] = qvel[i];
+    const auto& motion = wp::index(robots.cdof, world, i);
+    turning[m] = Vec(motion[0], motion[1], motion[2]);
+    moving[m] = Vec(motion[3], motion[4], motion[5]);
+}
+read_entries(0);
+Found found = read_found(0);
 #pragma unroll 1
-for (int m = lane; m < (NV + 1) * LD; m += LANES) inertia[m] = 0.0f;  // with the vector
+for (int m = 4 * lane; m < (NV + 1) * LD; m += 4 * LANES) *(Float4*)(inertia + m) = Float4{};  // with the vector
 sync();
 #pragma unroll 1
-for (int m = lane; m < $inertia; m += LANES) {
-    const int i = problem.M_hinit_i.data[m], j = problem.M_colind.data[m];
-    inertia[i * LD + j] = inertia[j * LD + i] = wp::index(robots.M, world, m);
+for (int begin = 0; begin < NUM_ENTRIES; begin += AT_ONCE * LANES) {
+    if (begin > 0) read_entries(begin);
+    #pragma unroll
+    for (int k = 0; k < AT_ONCE; ++k) {
+        inertia[rows[k] * LD + columns[k]] = inertia[columns[k] * LD + rows[k]] = entries[k];
+    }
 }
-float trace = 0.0f, speed[PER_LANE];
 sync();
 #pragma unroll ALL
 for (int m = 0; m < PER_LANE; ++m) {
     const int i = lane + m * LANES;
-    qacc[m] = constraint[m] = smooth[m] = limit_d[m] = limit_aref[m] = side[m] = 0.0f;
-    momentum[m] = gradient[m] = search[m] = speed[m] = loss[m] = loss_d[m] = loss_aref[m] = 0.0f;
-    if (i >= NV) continue;
+    constraint[m] = limit_d[m] = limit_aref[m] = side[m] = 0.0f;
+    momentum[m] = gradient[m] = search[m] = loss[m] = loss_d[m] = loss_aref[m] = 0.0f;
+    if (i >= NV) {
+        qacc[m] = smooth[m] = speed[m] = 0.0f;
+        continue;
+    }
     trace += inertia[i * LD + i];
-    qacc[m] = wp::index(problem.qacc_warmstart, world, i);
-    smooth[m] = wp::index(robots.qfrc_smooth, world, i);
-    speed[m] = qvel[i];
     const int joint = problem.dof_jntid.data[i];
     const float weight = model_value(problem.dof_invweight0, i);
     if (problem.jnt_limited.data[joint]) {
@@ -608,77 +649,75 @@ for (int m = 0; m < PER_LANE; ++m) {
 }
 const float scale = 1.0f / wp::max(MINVAL, total(trace));
 #pragma unroll 1
-for (int begin = 0; begin < num_contacts; begin += LANES) {  // each lane reads one contact and shares it
-    const int index = wp::min(begin + lane, num_contacts - 1), shape = wp::index(problem.contacts.shape, world, index);
-    const int rank = wp::index(problem.contacts.rank, world, index);
+for (int begin = 0; begin < num_contacts; begin += LANES) {
+    if (begin > 0) found = read_found(begin);
     int place = 0;  // in the order of ranks, so that sums over contacts repeat
+    #pragma unroll 1
     for (int c = 0; c < num_contacts; ++c) {
-        const int other = wp::index(problem.contacts.rank, world, c);
-        place += other < rank || (other == rank && c < index);
+        const bool here = begin <= c && c < begin + LANES;
+        const int other = here ? (int)shuffle((float)found.rank, c - begin) : wp::index(problem.contacts.rank, world, c);
+        place += other < found.rank || (other == found.rank && c < found.slot);
     }
-    const int body = problem.surfaces.body.data[shape], condim = problem.surfaces.condim.data[shape];
-    const Vec normal = wp::index(problem.contacts.normal, world, index);
-    const Vec arm = wp::index(problem.contacts.point, world, index)
-        - wp::index(robots.subtree_com, world, problem.body_rootid.data[body]);
+    const int shape = found.shape, body = problem.surfaces.body.data[shape], dim = problem.surfaces.condim.data[shape];
+    const Vec arm = found.point - wp::index(robots.subtree_com, world, problem.body_rootid.data[body]);
+    Vec frame[3];
+    make_frame(found.normal, frame);
+    if (begin + lane < num_contacts) {
+        Contact& contact = get_contact(place);
+        Vec2 solref = model_value(problem.surfaces.solref, shape);
+        Vec5 solimp = model_value(problem.surfaces.solimp, shape);
+        const Vec5& friction = model_value(problem.surfaces.friction, shape);
+        if (found.soft > wp::max(solref[0], 0.0f)) {  // soft ground has constant impedance
+            solref = Vec2(found.soft, 1.0f);
+            solimp[0] = solimp[1];
+        }
+        const Spring s = make_spring(solref, solimp, found.distance);
+        const float weight = model_value(problem.body_invweight0, body)[0] + model_value(problem.body_invweight0, 0)[0];
+        const float d = compute_stiffness(weight, s.impedance), first = friction[0] * found.factor;
+        #pragma unroll
+        for (int k = 0; k < DIM; ++k) {
+            const float mu = friction[wp::max(k, 1) - 1] * (k <= 2 ? found.factor : 1.0f), ratio = mu / (first * root_impratio);
+            contact.d[k] = k == 0 ? d : d * ratio * ratio;
+            contact.friction[k] = k == 0 ? mu * root_impratio : k < dim ? mu : 0.0f;
+        }
+        contact.slot = found.slot;
+        contact.jv[0] = s.damping;  // until the Jacobian is there
+        contact.force[0] = s.stiffness * s.impedance * found.distance;
+    }
     auto shuffle_vector = [&](const Vec& v, int s) { return Vec(shuffle(v[0], s), shuffle(v[1], s), shuffle(v[2], s)); };
     #pragma unroll 1
     for (int s = 0; s < wp::min(LANES, num_contacts - begin); ++s) {
         Contact& contact = get_contact((int)shuffle((float)place, s));
-        if (lane == 0) contact.slot = begin + s;
+        const int touching = (int)shuffle((float)body, s), rows_of_it = (int)shuffle((float)dim, s);
         const Vec offset = shuffle_vector(arm, s);
-        const int touching = (int)shuffle((float)body, s), dim = (int)shuffle((float)condim, s);
-        Vec frame[3];
-        make_frame(shuffle_vector(normal, s), frame);
-        #pragma unroll 1
-        for (int i = lane; i < LD; i += LANES) {
+        const Vec axes[3] = {shuffle_vector(frame[0], s), shuffle_vector(frame[1], s), shuffle_vector(frame[2], s)};
+        #pragma unroll ALL
+        for (int m = 0; m < PER_ROW; ++m) {
+            const int i = lane + m * LANES;
+            if (i >= LD) continue;
             Vec turned, moved;
             if (i < NV && wp::index(problem.body_isdofancestor, touching, i)) {
-                const auto& motion = wp::index(robots.cdof, world, i);
-                turned = Vec(motion[0], motion[1], motion[2]);
-                moved = Vec(motion[3], motion[4], motion[5]) + wp::cross(turned, offset);
+                turned = turning[wp::min(m, PER_LANE - 1)];
+                moved = moving[wp::min(m, PER_LANE - 1)] + wp::cross(turned, offset);
             }
             #pragma unroll
             for (int k = 0; k < DIM; ++k) {
-                contact.jacobian[k][i] = k >= dim ? 0.0f : k < 3 ? wp::dot(frame[k], moved) : wp::dot(frame[k % 3], turned);
+                contact.jacobian[k][i] = k >= rows_of_it ? 0.0f : wp::dot(axes[k % 3], k < 3 ? moved : turned);
             }
         }
     }
 }
-write_vector(speed);
-#pragma unroll 1
-for (int c = lane; c < num_contacts; c += LANES) {
-    Contact& contact = get_contact(c);
-    const int slot = contact.slot, shape = wp::index(problem.contacts.shape, world, slot);
-    const int dim = problem.surfaces.condim.data[shape];
-    Vec2 solref = model_value(problem.surfaces.solref, shape);
-    Vec5 solimp = model_value(problem.surfaces.solimp, shape);
-    const Vec5& friction = model_value(problem.surfaces.friction, shape);
-    const float factor = wp::index(problem.contacts.friction, world, slot);
-    const float soft = wp::index(problem.contacts.time_constant, world, slot);
-    if (soft > wp::max(solref[0], 0.0f)) {  // soft ground has constant impedance
-        solref = Vec2(soft, 1.0f);
-        solimp[0] = solimp[1];
-    }
-    const float distance = wp::index(problem.contacts.distance, world, slot);
-    const Spring s = make_spring(solref, solimp, distance);
-    const auto& weights = model_value(problem.body_invweight0, problem.surfaces.body.data[shape]);
-    const float d = compute_stiffness(weights[0] + model_value(problem.body_invweight0, 0)[0], s.impedance);
-    #pragma unroll
-    for (int k = 0; k < DIM; ++k) {
-        const float mu = friction[wp::max(k, 1) - 1] * (k <= 2 ? factor : 1.0f), first = friction[0] * factor;
-        const float ratio = mu / (first * root_impratio);
-        contact.d[k] = k == 0 ? d : d * ratio * ratio;
-        contact.friction[k] = k == 0 ? mu * root_impratio : k < dim ? mu : 0.0f;
-        contact.jaref[k] = s.damping * product(contact.jacobian[k], vector);
-    }
-    contact.jaref[0] += s.stiffness * s.impedance * distance;
+#pragma unroll ALL
+for (int m = 0; m < PER_ROW; ++m) {
+    const int i = lane + m * LANES;
+    if (i < LD) part[i] = i < NV ? speed[wp::min(m, PER_LANE - 1)] : 0.0f;
 }
 write_vector(qacc);
 #pragma unroll 1
-for (int c = lane; c < num_contacts; c += LANES) {
-    Contact& contact = get_contact(c);
-    #pragma unroll
-    for (int k = 0; k < DIM; ++k) contact.jaref[k] += product(contact.jacobian[k], vector);
+for (int r = lane; r < num_contacts * DIM; r += LANES) {
+    Contact& contact = get_contact(r / DIM);
+    const float *row = contact.jacobian[r % DIM], push = r % DIM == 0 ? contact.force[0] : 0.0f;
+    contact.jaref[r % DIM] = contact.jv[0] * product(row, part) + push + product(row, vector);
 }
 times_inertia(momentum);
 
