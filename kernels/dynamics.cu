@@ -1,30 +1,41 @@
 // Quantities are stored body by body or dof by dof. Spatial vectors have the rotation first, and are
 // taken at the mass centre of the body's tree, in the world's axes. The world is body 0.
 struct Quat { float w, x, y, z; };
+struct alignas(8) Two { float v[2]; };
 struct Six { float v[6]; };
-constexpr int NB = $bodies, NV = $dofs, NJ = $joints, LEVELS = $levels;
+constexpr int NB = $bodies, NQ = $coordinates, NV = $dofs, NU = $actuators, LEVELS = $levels, NUM_ENTRIES = $inertia;
+constexpr int LINKS = (NB - 2 + LANES) / LANES;  // bodies of a lane
 enum { FREE = $free, SLIDE = $slide, HINGE = $hinge };
 using Vec = wp::vec_t<3, float>;
-float* position = memory;           // NB x 3
-float* rotation = position + NB * 3;  // NB x 4, wxyz
-float* centre = rotation + NB * 4;  // NB x 3: mass centres
-float* inertia = centre + NB * 3;   // NB x 10; then of all that a body carries
+struct Link {  // a body: its parent, the world's row of it, and its pose; at first in the axes of its parent
+    int body, parent, root, level, first, num_joints;
+    Vec position, centre;
+    Quat rotation;
+};
+float* motion = memory;               // NV x 6: of each dof; before, at its first dof, a joint's axis and anchor
+float* carried = motion + NV * 6;     // NV x 6: momentum at unit speed of all that a dof moves
+float* inertia = carried + NV * 6;    // NB x 10; then of all that a body carries
 float* velocity = inertia + NB * 10;  // NB x 6
-float* force = velocity + NB * 6;   // NB x 6: accelerations; then forces
-float* com = force + NB * 6;        // NB x 3: mass centre of a tree, at its root
-float* motion = com + NB * 3;       // NV x 6: of each dof; before, at its first dof, a joint's axis and anchor
-const float* qpos = &wp::index(robots.qpos, world, 0);
-const float* qvel = &wp::index(robots.qvel, world, 0);
+float* force = velocity + NB * 6;     // NB x 6: accelerations; then forces
+float* position = force + NB * 6;     // NB x 3
+float* rotation = position + NB * 3;  // NB x 4, wxyz
+float* com = rotation + NB * 4;       // NB x 3: mass centre of a tree, at its root
+float* qpos = com + NB * 3;           // NQ, then NV of qvel and NU of ctrl
+float *qvel = qpos + NQ, *ctrl = qvel + NV;
 
 auto get = [](const float* array, int k) { return Vec(array[3 * k], array[3 * k + 1], array[3 * k + 2]); };
 auto put = [](float* array, int k, const Vec& v) { array[3 * k] = v[0]; array[3 * k + 1] = v[1]; array[3 * k + 2] = v[2]; };
 auto get_six = [](const float* array, int k) {
     Six s;
-    for (int i = 0; i < 6; ++i) s.v[i] = array[6 * k + i];
+    for (int i = 0; i < 6; i += 2) {
+        const Two two = *(const Two*)(array + 6 * k + i);
+        s.v[i] = two.v[0];
+        s.v[i + 1] = two.v[1];
+    }
     return s;
 };
 auto put_six = [](float* array, int k, const Six& s) {
-    for (int i = 0; i < 6; ++i) array[6 * k + i] = s.v[i];
+    for (int i = 0; i < 6; i += 2) *(Two*)(array + 6 * k + i) = Two{{s.v[i], s.v[i + 1]}};
 };
 auto get_quat = [&](int k) { return Quat{rotation[4 * k], rotation[4 * k + 1], rotation[4 * k + 2], rotation[4 * k + 3]}; };
 auto to_quat = [](const wp::quat_t<float>& q) { return Quat{q.x, q.y, q.z, q.w}; };  // the solver's arrays have wxyz
@@ -69,10 +80,18 @@ auto momentum = [](const float* i, const Six& s) {
          i[4] * v[0] + i[5] * v[1] + i[2] * v[2] - i[7] * v[3] + i[6] * v[4], i[8] * v[1] - i[7] * v[2] + i[9] * v[3],
          i[6] * v[2] - i[8] * v[0] + i[9] * v[4], i[7] * v[0] - i[6] * v[1] + i[9] * v[5]}};
 };
-auto first_joint = [&](int body) { return tree.body_jntadr.data[body]; };
-auto num_joints = [&](int body) { return tree.body_jntnum.data[body]; };
 
-// Poses, from the root of each tree outward.
+// State, and poses in the axes of the parent: what lies far away is asked for at once.
+constexpr int NUM_FAR = NQ + NV + NU, FAR = (NUM_FAR + LANES - 1) / LANES;
+float far[FAR];
+#pragma unroll ALL
+for (int k = 0; k < FAR; ++k) {
+    const int m = lane + k * LANES;
+    far[k] = 0.0f;
+    if (m < NQ) far[k] = wp::index(robots.qpos, world, m);
+    else if (m < NQ + NV) far[k] = wp::index(robots.qvel, world, m - NQ);
+    else if (m < NUM_FAR) far[k] = wp::index(robots.ctrl, world, m - NQ - NV);
+}
 if (lane == 0) {
     put(position, 0, Vec());
     for (int i = 0; i < 4; ++i) rotation[i] = i == 0 ? 1.0f : 0.0f;
@@ -81,56 +100,88 @@ if (lane == 0) {
     put_six(force, 0, six(Vec(), -gravity));  // as if the world accelerated upward
     for (int i = 0; i < 10; ++i) inertia[i] = 0.0f;
 }
+Link links[LINKS];
+#pragma unroll ALL
+for (int k = 0; k < LINKS; ++k) {
+    Link& link = links[k];
+    const int n = lane + k * LANES, body = tree.body_order.data[wp::min(n, NB - 2)];
+    link.body = body;
+    link.level = n < NB - 1 ? tree.body_level.data[n] : -1;
+    link.parent = tree.body_parentid.data[body];
+    link.root = tree.body_rootid.data[body];
+    link.first = tree.body_jntadr.data[body];
+    link.num_joints = tree.body_jntnum.data[body];
+    link.position = model_value(tree.body_pos, body);
+    link.rotation = to_quat(model_value(tree.body_quat, body));
+    link.centre = model_value(tree.body_ipos, body);
+}
+#pragma unroll ALL
+for (int k = 0; k < FAR; ++k) {
+    if (lane + k * LANES < NUM_FAR) qpos[lane + k * LANES] = far[k];
+}
 sync();
+#pragma unroll ALL
+for (int k = 0; k < LINKS; ++k) {
+    Link& link = links[k];
+    if (link.level < 0) continue;
+    #pragma unroll 1
+    for (int j = link.first; j < link.first + link.num_joints; ++j) {
+        const int column = tree.jnt_qposadr.data[j], type = tree.jnt_type.data[j];
+        if (type == FREE) {  // a child of the world
+            link.position = Vec(qpos[column], qpos[column + 1], qpos[column + 2]);
+            link.rotation = Quat{qpos[column + 3], qpos[column + 4], qpos[column + 5], qpos[column + 6]};
+            continue;
+        }
+        const Vec axis = model_value(tree.jnt_axis, j), offset = model_value(tree.jnt_pos, j);
+        const Vec anchor = turn(link.rotation, offset) + link.position, turned = turn(link.rotation, axis);
+        const float moved = qpos[column] - model_value(tree.qpos0, column);
+        if (type == SLIDE) {
+            link.position += turned * moved;
+        } else {
+            const float s = wp::sin(0.5f * moved), c = wp::cos(0.5f * moved);
+            link.rotation = times(link.rotation, Quat{c, axis[0] * s, axis[1] * s, axis[2] * s});
+            link.position = anchor - turn(link.rotation, offset);
+        }
+        put_six(motion, tree.jnt_dofadr.data[j], six(turned, anchor));
+    }
+}
+
+// Poses in the world, from the root of each tree outward.
 #pragma unroll 1
 for (int level = 0; level < LEVELS; ++level) {
-    #pragma unroll 1
-    for (int n = tree.level_start.data[level] + lane; n < tree.level_start.data[level + 1]; n += LANES) {
-        const int body = tree.body_order.data[n], parent = tree.body_parentid.data[body], first = first_joint(body);
-        Vec x;
-        Quat q;
-        if (num_joints(body) > 0 && tree.jnt_type.data[first] == FREE) {
-            const float* base = qpos + tree.jnt_qposadr.data[first];
-            x = Vec(base[0], base[1], base[2]);
-            q = Quat{base[3], base[4], base[5], base[6]};
-        } else {
-            const Quat q_parent = get_quat(parent);
-            x = turn(q_parent, model_value(tree.body_pos, body)) + get(position, parent);
-            q = times(q_parent, to_quat(model_value(tree.body_quat, body)));
-            #pragma unroll 1
-            for (int j = first; j < first + num_joints(body); ++j) {
-                const Vec axis = model_value(tree.jnt_axis, j), offset = model_value(tree.jnt_pos, j);
-                const Vec anchor = turn(q, offset) + x, turned = turn(q, axis);
-                const int column = tree.jnt_qposadr.data[j];
-                const float moved = qpos[column] - model_value(tree.qpos0, column);
-                if (tree.jnt_type.data[j] == SLIDE) {
-                    x += turned * moved;
-                } else {
-                    const float s = wp::sin(0.5f * moved), c = wp::cos(0.5f * moved);
-                    q = times(q, Quat{c, axis[0] * s, axis[1] * s, axis[2] * s});
-                    x = anchor - turn(q, offset);
-                }
-                put_six(motion, tree.jnt_dofadr.data[j], six(turned, anchor));
-            }
-        }
-        q = normal(q);
-        put(position, body, x);
-        rotation[4 * body] = q.w;
-        rotation[4 * body + 1] = q.x;
-        rotation[4 * body + 2] = q.y;
-        rotation[4 * body + 3] = q.z;
-        put(centre, body, x + turn(q, model_value(tree.body_ipos, body)));
-        wp::index(robots.xpos, world, body) = x;
-        wp::index(robots.xquat, world, body) = wp::quat_t<float>(q.w, q.x, q.y, q.z);
+    #pragma unroll ALL
+    for (int k = 0; k < LINKS; ++k) {
+        Link& link = links[k];
+        if (link.level != level) continue;
+        const Quat q = get_quat(link.parent);
+        const Quat turned = link.rotation = normal(times(q, link.rotation));
+        link.position = turn(q, link.position) + get(position, link.parent);
+        put(position, link.body, link.position);
+        float* numbers = rotation + 4 * link.body;
+        numbers[0] = turned.w;
+        numbers[1] = turned.x;
+        numbers[2] = turned.y;
+        numbers[3] = turned.z;
     }
     sync();
+}
+#pragma unroll ALL
+for (int k = 0; k < LINKS; ++k) {
+    Link& link = links[k];
+    if (link.level < 0) continue;
+    const Quat& q = link.rotation;
+    link.centre = link.position + turn(q, link.centre);
+    wp::index(robots.xpos, world, link.body) = link.position;
+    wp::index(robots.xquat, world, link.body) = wp::quat_t<float>(q.w, q.x, q.y, q.z);
 }
 #pragma unroll 1
 for (int n = 0; n < tree.roots.shape[0]; ++n) {
     const int root = tree.roots.data[n];
     Vec sum;
-    for (int body = 1 + lane; body < NB; body += LANES) {
-        if (tree.body_rootid.data[body] == root) sum += get(centre, body) * model_value(tree.body_mass, body);
+    #pragma unroll ALL
+    for (int k = 0; k < LINKS; ++k) {
+        const Link& link = links[k];
+        if (link.level >= 0 && link.root == root) sum += link.centre * model_value(tree.body_mass, link.body);
     }
     for (int i = 0; i < 3; ++i) sum[i] = total(sum[i]);
     const float mass = model_value(tree.body_subtreemass, root);
@@ -143,11 +194,14 @@ for (int n = 0; n < tree.roots.shape[0]; ++n) {
 sync();
 
 // Inertias and motions at the mass centre.
-#pragma unroll 1
-for (int body = 1 + lane; body < NB; body += LANES) {
-    const Quat q = times(get_quat(body), to_quat(model_value(tree.body_iquat, body)));
+#pragma unroll ALL
+for (int k = 0; k < LINKS; ++k) {
+    const Link& link = links[k];
+    if (link.level < 0) continue;
+    const int body = link.body;
+    const Vec middle = get(com, link.root), d = link.centre - middle, moment = model_value(tree.body_inertia, body);
+    const Quat q = times(link.rotation, to_quat(model_value(tree.body_iquat, body)));
     const Vec x = turn(q, Vec(1.0f, 0.0f, 0.0f)), y = turn(q, Vec(0.0f, 1.0f, 0.0f)), z = turn(q, Vec(0.0f, 0.0f, 1.0f));
-    const Vec d = get(centre, body) - get(com, tree.body_rootid.data[body]), moment = model_value(tree.body_inertia, body);
     const float mass = model_value(tree.body_mass, body);
     auto entry = [&](int i, int j) {
         const float product = i == j ? d[i] * d[j] - wp::dot(d, d) : d[i] * d[j];
@@ -162,22 +216,24 @@ for (int body = 1 + lane; body < NB; body += LANES) {
     entries[5] = entry(1, 2);
     for (int i = 0; i < 3; ++i) entries[6 + i] = mass * d[i];
     entries[9] = mass;
-}
-#pragma unroll 1
-for (int j = lane; j < NJ; j += LANES) {
-    const int body = tree.jnt_bodyid.data[j], dof = tree.jnt_dofadr.data[j], type = tree.jnt_type.data[j];
-    const Vec middle = get(com, tree.body_rootid.data[body]);
-    if (type == FREE) {
-        const Quat q = get_quat(body);
-        const Vec offset = middle - get(position, body);
-        for (int i = 0; i < 3; ++i) {
-            const Vec axis(i == 0 ? 1.0f : 0.0f, i == 1 ? 1.0f : 0.0f, i == 2 ? 1.0f : 0.0f), turned = turn(q, axis);
-            put_six(motion, dof + i, six(Vec(), axis));
-            put_six(motion, dof + 3 + i, six(turned, wp::cross(turned, offset)));
+    #pragma unroll 1
+    for (int j = link.first; j < link.first + link.num_joints; ++j) {
+        const int dof = tree.jnt_dofadr.data[j], type = tree.jnt_type.data[j];
+        if (type == FREE) {
+            const Vec offset = middle - link.position;
+            #pragma unroll 1
+            for (int i = 0; i < 3; ++i) {
+                const Vec axis(i == 0 ? 1.0f : 0.0f, i == 1 ? 1.0f : 0.0f, i == 2 ? 1.0f : 0.0f);
+                const Vec turned = turn(link.rotation, axis);
+                put_six(motion, dof + i, six(Vec(), axis));
+                put_six(motion, dof + 3 + i, six(turned, wp::cross(turned, offset)));
+            }
+            continue;
         }
-    } else {
-        const Six joint_line = get_six(motion, dof);
-        const Vec axis = rotation_part(joint_line), offset = middle - linear_part(joint_line);
+        const Six line = get_six(motion, dof);
+        const Quat above = get_quat(link.parent);
+        const Vec axis = turn(above, rotation_part(line));
+        const Vec offset = middle - turn(above, linear_part(line)) - get(position, link.parent);
         put_six(motion, dof, type == SLIDE ? six(Vec(), axis) : six(axis, wp::cross(axis, offset)));
     }
 }
@@ -192,64 +248,62 @@ for (int n = lane; n < NV; n += LANES) {
 // Velocities and accelerations at zero joint acceleration, outward; then the forces that they need, inward.
 #pragma unroll 1
 for (int level = 0; level < LEVELS; ++level) {
-    #pragma unroll 1
-    for (int n = tree.level_start.data[level] + lane; n < tree.level_start.data[level + 1]; n += LANES) {
-        const int body = tree.body_order.data[n], parent = tree.body_parentid.data[body];
-        Six v = get_six(velocity, parent), a = get_six(force, parent);
+    #pragma unroll ALL
+    for (int k = 0; k < LINKS; ++k) {
+        const Link& link = links[k];
+        if (link.level != level) continue;
+        Six v = get_six(velocity, link.parent), a = get_six(force, link.parent);
         #pragma unroll 1
-        for (int j = first_joint(body); j < first_joint(body) + num_joints(body); ++j) {
-            int dof = tree.jnt_dofadr.data[j];
-            if (tree.jnt_type.data[j] == FREE) {
-                for (int i = 0; i < 3; ++i) add(v, get_six(motion, dof + i), qvel[dof + i]);
-                const Six linear = v;
-                for (int i = 3; i < 6; ++i) {
-                    const Six s = get_six(motion, dof + i);
-                    add(a, change_of_motion(linear, s), qvel[dof + i]);
-                    add(v, s, qvel[dof + i]);
-                }
-            } else {
-                const Six s = get_six(motion, dof);
-                add(a, change_of_motion(v, s), qvel[dof]);
-                add(v, s, qvel[dof]);
+        for (int j = link.first; j < link.first + link.num_joints; ++j) {
+            const int dof = tree.jnt_dofadr.data[j];
+            const float* speed = qvel + dof;
+            if (tree.jnt_type.data[j] == FREE) {  // v is 0 before
+                const Vec linear(speed[0], speed[1], speed[2]);
+                for (int i = 3; i < 6; ++i) add(v, get_six(motion, dof + i), speed[i]);
+                add(a, six(Vec(), wp::cross(linear, rotation_part(v))), 1.0f);
+                add(v, six(Vec(), linear), 1.0f);
+                continue;
             }
+            const Six s = get_six(motion, dof);
+            add(a, change_of_motion(v, s), speed[0]);
+            add(v, s, speed[0]);
         }
-        put_six(velocity, body, v);
-        put_six(force, body, a);
+        put_six(velocity, link.body, v);
+        put_six(force, link.body, a);
     }
     sync();
 }
-#pragma unroll 1
-for (int body = 1 + lane; body < NB; body += LANES) {
+#pragma unroll ALL
+for (int k = 0; k < LINKS; ++k) {
+    const int body = links[k].body;
+    if (links[k].level < 0) continue;
     const Six v = get_six(velocity, body);
     Six f = momentum(inertia + 10 * body, get_six(force, body));
     add(f, change_of_force(v, momentum(inertia + 10 * body, v)), 1.0f);
     put_six(force, body, f);
 }
 sync();
-#pragma unroll 1
-for (int k = lane; k < 16; k += LANES) {  // each thread sums one number over all bodies
-    float* numbers = k < 6 ? force + k : inertia + k - 6;
-    const int stride = k < 6 ? 6 : 10;
+#pragma unroll ALL
+for (int k = LINKS - 1; k >= 0; --k) {
     #pragma unroll 1
-    for (int n = NB - 2; n >= 0; --n) {
-        const int body = tree.body_order.data[n], parent = tree.body_parentid.data[body];
-        if (parent > 0) numbers[stride * parent] += numbers[stride * body];
+    for (int n = wp::min(LANES, NB - 1 - k * LANES) - 1; n >= 0; --n) {
+        const int body = shuffle(links[k].body, n), parent = shuffle(links[k].parent, n);
+        #pragma unroll 1
+        for (int m = lane; m < 16 && parent > 0; m += LANES) {  // each thread sums one number over all bodies
+            float* numbers = m < 6 ? force + m : inertia + m - 6;
+            const int stride = m < 6 ? 6 : 10;
+            numbers[stride * parent] += numbers[stride * body];
+        }
     }
 }
 sync();
 
 // Inertia of the joints, and the forces on them.
 #pragma unroll 1
-for (int n = lane; n < NV; n += LANES) {
+for (int n = NV - 1 - lane; n >= 0; n -= LANES) {  // a base's dofs, which have less to do, come last
     const int body = tree.dof_bodyid.data[n], joint = tree.dof_jntid.data[n];
-    const Six s = get_six(motion, n), carried = momentum(inertia + 10 * body, s);
-    const int start = tree.M_rowadr.data[n];  // a row leaves out ancestors whose entries are always 0
-    int column = start + tree.M_rownnz.data[n] - 1;
-    wp::index(robots.M, world, column) = model_value(tree.dof_armature, n) + dot(s, carried);
-    #pragma unroll 1
-    for (int m = tree.dof_parentid.data[n]; column > start; m = tree.dof_parentid.data[m]) {
-        wp::index(robots.M, world, --column) = dot(get_six(motion, m), carried);
-    }
+    const Six s = get_six(motion, n);
+    put_six(carried, n, momentum(inertia + 10 * body, s));
     const float damping = model_value(tree.dof_damping, n);
     const float strength = robots.strength.shape[0] > 0 ? wp::index(robots.strength, world) : 1.0f;
     float passive = -damping * qvel[n], driven = 0.0f, slope = damping;
@@ -261,7 +315,7 @@ for (int n = lane; n < NV; n += LANES) {
             const auto& gain = wp::index(tree.actuator_gainprm, world % tree.actuator_gainprm.shape[0], a, 0);
             const float* bias = &wp::index(tree.actuator_biasprm, world % tree.actuator_biasprm.shape[0], a, 0);
             const float gear = model_value(tree.actuator_gear, a)[0];
-            float control = wp::index(robots.ctrl, world, a);
+            float control = ctrl[a];
             if (tree.actuator_ctrllimited.data[a]) {
                 const auto range = model_value(tree.actuator_ctrlrange, a);
                 control = wp::clamp(control, range[0], range[1]);
@@ -288,4 +342,11 @@ for (int n = lane; n < NV; n += LANES) {
     wp::index(robots.qfrc_actuator, world, n) = driven;
     wp::index(robots.qfrc_smooth, world, n) = passive - dot(s, get_six(force, body)) + driven;
     wp::index(robots.slope, world, n) = slope;
+}
+sync();
+#pragma unroll 1
+for (int m = lane; m < NUM_ENTRIES; m += LANES) {
+    const int row = tree.M_hinit_i.data[m], column = tree.M_colind.data[m];
+    const float armature = row == column ? model_value(tree.dof_armature, row) : 0.0f;
+    wp::index(robots.M, world, m) = armature + dot(get_six(motion, column), get_six(carried, row));
 }

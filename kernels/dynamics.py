@@ -26,10 +26,10 @@ class Tree:
     Arrays of two or more dimensions have a row for each world, or one for all.
     """
 
-    level_start: wp.array[int]
-    """Where each level of the trees begins in ``body_order``, shape (num_levels + 1,)."""
     body_order: wp.array[int]
     """Bodies level by level, without the world."""
+    body_level: wp.array[int]
+    """Level of each of them; a body on the world has 0."""
     roots: wp.array[int]
     """Bodies at the root of a tree."""
     dof_actuator: wp.array[int]
@@ -39,14 +39,12 @@ class Tree:
     body_jntadr: wp.array[int]
     body_jntnum: wp.array[int]
     jnt_type: wp.array[int]
-    jnt_bodyid: wp.array[int]
     jnt_qposadr: wp.array[int]
     jnt_dofadr: wp.array[int]
     dof_bodyid: wp.array[int]
     dof_jntid: wp.array[int]
-    dof_parentid: wp.array[int]
-    M_rowadr: wp.array[int]
-    M_rownnz: wp.array[int]
+    M_hinit_i: wp.array[int]
+    M_colind: wp.array[int]
     gravity: wp.array[wp.vec3]
     body_pos: wp.array2d[wp.vec3]
     body_quat: wp.array2d[wp.quat]
@@ -105,14 +103,17 @@ class TreeSizes:
     """Sizes of a model, which its kernel is compiled for."""
 
     bodies: int
+    coordinates: int
     dofs: int
-    joints: int
+    actuators: int
     levels: int
+    inertia: int
+    """Stored entries of the inertia."""
 
     @property
     def shared_floats(self) -> int:
         """Floats of shared memory that a robot needs."""
-        return 35 * self.bodies + 6 * self.dofs
+        return 32 * self.bodies + self.coordinates + 13 * self.dofs + self.actuators
 
 
 @cache

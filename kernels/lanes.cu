@@ -6,7 +6,7 @@ const unsigned lanes_mask = LANES == 32 ? 0xffffffffu : (0xffffffffu >> (32 - LA
 __shared__ alignas(16) float pool[$worlds * $num_floats];
 float* memory = pool + threadIdx.x / LANES * $num_floats;
 auto sync = [&] { __syncwarp(lanes_mask); };
-auto shuffle = [&](float x, int k) { return __shfl_sync(lanes_mask, x, k, LANES); };  // the x of lane k
+auto shuffle = [&](auto x, int k) { return __shfl_sync(lanes_mask, x, k, LANES); };  // the x of lane k
 // The same bits in all lanes: a fused multiply-add would round differently from lane to lane.
 auto total = [&](float x) {
     for (int k = LANES / 2; k > 0; k /= 2) x = __fadd_rn(x, __shfl_xor_sync(lanes_mask, x, k));
@@ -17,7 +17,7 @@ constexpr int LANES = 1;
 const int lane = 0;
 alignas(16) float memory[$num_floats];
 auto sync = [] {};
-auto shuffle = [](float x, int) { return x; };
+auto shuffle = [](auto x, int) { return x; };
 auto total = [](float x) { return x; };
 #endif
 const int world = thread / LANES;

@@ -655,7 +655,7 @@ for (int begin = 0; begin < num_contacts; begin += LANES) {
     #pragma unroll 1
     for (int c = 0; c < num_contacts; ++c) {
         const bool here = begin <= c && c < begin + LANES;
-        const int other = here ? (int)shuffle((float)found.rank, c - begin) : wp::index(problem.contacts.rank, world, c);
+        const int other = here ? shuffle(found.rank, c - begin) : wp::index(problem.contacts.rank, world, c);
         place += other < found.rank || (other == found.rank && c < found.slot);
     }
     const int shape = found.shape, body = problem.surfaces.body.data[shape], dim = problem.surfaces.condim.data[shape];
@@ -687,8 +687,8 @@ for (int begin = 0; begin < num_contacts; begin += LANES) {
     auto shuffle_vector = [&](const Vec& v, int s) { return Vec(shuffle(v[0], s), shuffle(v[1], s), shuffle(v[2], s)); };
     #pragma unroll 1
     for (int s = 0; s < wp::min(LANES, num_contacts - begin); ++s) {
-        Contact& contact = get_contact((int)shuffle((float)place, s));
-        const int touching = (int)shuffle((float)body, s), rows_of_it = (int)shuffle((float)dim, s);
+        Contact& contact = get_contact(shuffle(place, s));
+        const int touching = shuffle(body, s), rows_of_it = shuffle(dim, s);
         const Vec offset = shuffle_vector(arm, s);
         const Vec axes[3] = {shuffle_vector(frame[0], s), shuffle_vector(frame[1], s), shuffle_vector(frame[2], s)};
         #pragma unroll ALL
@@ -719,6 +719,7 @@ for (int r = lane; r < num_contacts * DIM; r += LANES) {
     const float *row = contact.jacobian[r % DIM], push = r % DIM == 0 ? contact.force[0] : 0.0f;
     contact.jaref[r % DIM] = contact.jv[0] * product(row, part) + push + product(row, vector);
 }
+sync();
 times_inertia(momentum);
 
 int iteration = 0, bits = num_found > capacity ? $too_many_contacts : 0;

@@ -122,13 +122,13 @@ def is_supported(m: Any) -> bool:
 
 
 def _levels(m: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Bodies but the world in order of depth, and where each depth begins."""
+    """Bodies but the world in order of depth, and their depths."""
     parent = m.body_parentid.numpy()
-    depth = np.zeros(m.nbody, int)
+    depth = np.full(m.nbody, -1, np.int32)
     for body in range(1, m.nbody):
         depth[body] = depth[parent[body]] + 1
     order = np.argsort(depth, kind="stable")[1:].astype(np.int32)
-    return order, np.searchsorted(depth[order], np.arange(1, depth.max() + 2)).astype(np.int32)
+    return order, depth[order]
 
 
 class Dynamics:
@@ -163,8 +163,8 @@ class Dynamics:
                 Tree,
                 model,
                 m.opt,
-                level_start=wp.array(levels, dtype=int),
                 body_order=wp.array(order, dtype=int),
+                body_level=wp.array(levels, dtype=int),
                 dof_actuator=wp.array(actuator, dtype=int),
                 roots=wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int),
             )
@@ -249,11 +249,19 @@ def make_dynamics(
     shapes, (num_shapes,), the same in all worlds, and ``ground`` is the ground's.
     """
     surfaces = mix_surfaces(m, geoms, ground)
-    tree = TreeSizes(bodies=m.nbody, dofs=m.nv, joints=m.njnt, levels=len(_levels(m)[1]) - 1)
+    entries = m.M_colind.shape[0]
+    tree = TreeSizes(
+        bodies=m.nbody,
+        coordinates=m.nq,
+        dofs=m.nv,
+        actuators=m.nu,
+        levels=1 + int(_levels(m)[1].max()),
+        inertia=entries,
+    )
     sizes = Sizes(
         parents=tuple(m.dof_parentid.numpy().tolist()),
         dimensions=max(3, int(m.nmaxcondim)),
-        inertia=m.M_colind.shape[0],
+        inertia=entries,
         losses=bool((m.dof_frictionloss.numpy() > 0.0).any()),
     )
     fits = fits_block(tree.shared_floats, dynamics.LANES) and fits_block(sizes.shared_floats, solver.LANES)
