@@ -3,8 +3,9 @@
 struct Quat { float w, x, y, z; };
 struct alignas(8) Two { float v[2]; };
 struct Six { float v[6]; };
-constexpr int NB = $bodies, NQ = $coordinates, NV = $dofs, NU = $actuators, LEVELS = $levels, NUM_ENTRIES = $inertia;
+constexpr int NB = $bodies, NQ = $coordinates, NV = $dofs, NU = $actuators, NUM_ENTRIES = $inertia;
 constexpr int LINKS = (NB - 2 + LANES) / LANES;  // bodies of a lane
+constexpr int LEVELS = LANES == 1 ? 1 : $levels;  // one thread has its bodies in order
 enum { FREE = $free, SLIDE = $slide, HINGE = $hinge };
 using Vec = wp::vec_t<3, float>;
 struct Link {  // a body: its parent, the world's row of it, and its pose; at first in the axes of its parent
@@ -152,7 +153,7 @@ for (int level = 0; level < LEVELS; ++level) {
     #pragma unroll ALL
     for (int k = 0; k < LINKS; ++k) {
         Link& link = links[k];
-        if (link.level != level) continue;
+        if (LANES > 1 && link.level != level) continue;
         const Quat q = get_quat(link.parent);
         const Quat turned = link.rotation = normal(times(q, link.rotation));
         link.position = turn(q, link.position) + get(position, link.parent);
@@ -251,7 +252,7 @@ for (int level = 0; level < LEVELS; ++level) {
     #pragma unroll ALL
     for (int k = 0; k < LINKS; ++k) {
         const Link& link = links[k];
-        if (link.level != level) continue;
+        if (LANES > 1 && link.level != level) continue;
         Six v = get_six(velocity, link.parent), a = get_six(force, link.parent);
         #pragma unroll 1
         for (int j = link.first; j < link.first + link.num_joints; ++j) {
