@@ -46,9 +46,8 @@ auto times = [](const Quat& a, const Quat& b) {
         a.w * b.y - a.x * b.z + a.y * b.w + a.z * b.x, a.w * b.z + a.x * b.y - a.y * b.x + a.z * b.w};
 };
 auto normal = [](const Quat& q) {
-    const float length = wp::sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z);
-    if (!(length > 0.0f)) return Quat{0.0f, 0.0f, 0.0f, 0.0f};
-    return Quat{q.w / length, q.x / length, q.y / length, q.z / length};
+    const float length = wp::sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z), scale = length > 0.0f ? 1.0f / length : 0.0f;
+    return Quat{q.w * scale, q.x * scale, q.y * scale, q.z * scale};
 };
 auto turn = [](const Quat& q, const Vec& v) {
     const Vec u(q.x, q.y, q.z);
@@ -97,7 +96,7 @@ if (lane == 0) {
     put(position, 0, Vec());
     for (int i = 0; i < 4; ++i) rotation[i] = i == 0 ? 1.0f : 0.0f;
     for (int i = 0; i < 6; ++i) velocity[i] = 0.0f;
-    const Vec gravity = wp::index(tree.gravity, world % tree.gravity.shape[0]);
+    const Vec gravity = wp::index(tree.gravity, row_of(tree.gravity));
     put_six(force, 0, six(Vec(), -gravity));  // as if the world accelerated upward
     for (int i = 0; i < 10; ++i) inertia[i] = 0.0f;
 }
@@ -139,7 +138,8 @@ for (int k = 0; k < LINKS; ++k) {
         if (type == SLIDE) {
             link.position += turned * moved;
         } else {
-            const float s = wp::sin(0.5f * moved), c = wp::cos(0.5f * moved);
+            float s, c;
+            find_sine(0.5f * moved, s, c);
             link.rotation = times(link.rotation, Quat{c, axis[0] * s, axis[1] * s, axis[2] * s});
             link.position = anchor - turn(link.rotation, offset);
         }
@@ -313,8 +313,8 @@ for (int n = NV - 1 - lane; n >= 0; n -= LANES) {  // a base's dofs, which have 
         passive -= model_value(tree.jnt_stiffness, joint) * (qpos[coordinate] - model_value(tree.qpos_spring, coordinate));
         const int a = tree.dof_actuator.data[n];
         if (a >= 0) {
-            const auto& gain = wp::index(tree.actuator_gainprm, world % tree.actuator_gainprm.shape[0], a, 0);
-            const float* bias = &wp::index(tree.actuator_biasprm, world % tree.actuator_biasprm.shape[0], a, 0);
+            const auto& gain = wp::index(tree.actuator_gainprm, row_of(tree.actuator_gainprm), a, 0);
+            const float* bias = &wp::index(tree.actuator_biasprm, row_of(tree.actuator_biasprm), a, 0);
             const float gear = model_value(tree.actuator_gear, a)[0];
             float control = ctrl[a];
             if (tree.actuator_ctrllimited.data[a]) {

@@ -12,6 +12,7 @@ auto total = [&](float x) {
     for (int k = LANES / 2; k > 0; k /= 2) x = __fadd_rn(x, __shfl_xor_sync(lanes_mask, x, k));
     return x;
 };
+auto find_sine = [](float x, float& sine, float& cosine) { sincosf(x, &sine, &cosine); };
 #else
 constexpr int LANES = 1;
 const int lane = 0;
@@ -19,8 +20,13 @@ alignas(16) float memory[$num_floats];
 auto sync = [] {};
 auto shuffle = [](auto x, int) { return x; };
 auto total = [](float x) { return x; };
+auto find_sine = [](float x, float& sine, float& cosine) {
+    sine = wp::sin(x);
+    cosine = wp::cos(x);
+};
 #endif
 const int world = thread / LANES;
 if (robots.parked.data[world] == 2) return;
 constexpr int ALL = LANES == 1 ? 1 : 64;  // a GPU unrolls loops over registers; a CPU does not
-auto model_value = [&](const auto& array, int k) -> const auto& { return wp::index(array, world % array.shape[0], k); };
+auto row_of = [&](const auto& array) { return array.shape[0] == 1 ? 0 : world; };  // an array has a row for each world, or one for all
+auto model_value = [&](const auto& array, int k) -> const auto& { return wp::index(array, row_of(array), k); };

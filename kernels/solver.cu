@@ -27,10 +27,10 @@ Contact* spilled_contacts = (Contact*)&wp::index(problem.spilled_contacts, world
 auto get_contact = [&](int c) -> Contact& { return c < NUM_SHARED ? shared_contacts[c] : spilled_contacts[c - NUM_SHARED]; };
 const int capacity = problem.contacts.shape.shape[1];  // no constant: a robot with room for more has the same kernel
 const int num_found = problem.contacts.count.data[world], num_contacts = wp::min(num_found, capacity);
-const float dt = wp::index(problem.timestep, world % problem.timestep.shape[0]);
-const float root_impratio = wp::index(problem.impratio_invsqrt, world % problem.impratio_invsqrt.shape[0]);
-const float tolerance = wp::index(problem.tolerance, world % problem.tolerance.shape[0]);
-const float ls_tolerance = wp::index(problem.ls_tolerance, world % problem.ls_tolerance.shape[0]);
+const float dt = wp::index(problem.timestep, row_of(problem.timestep));
+const float root_impratio = wp::index(problem.impratio_invsqrt, row_of(problem.impratio_invsqrt));
+const float tolerance = wp::index(problem.tolerance, row_of(problem.tolerance));
+const float ls_tolerance = wp::index(problem.ls_tolerance, row_of(problem.ls_tolerance));
 float* qvel = &wp::index(robots.qvel, world, 0);
 float* qpos = &wp::index(robots.qpos, world, 0);
 auto safe = [](float x, float y) { return x / (y != 0.0f ? y : MINVAL); };
