@@ -152,7 +152,7 @@ auto update_forces = [&]() {
 // Solves h x = y in place by L^T D L; h is overwritten. Each lane holds its rows. The ground touches one branch of a robot's
 // tree at a time, so that h is as sparse as the inertia: a dof changes its ancestors alone (Featherstone, "Rigid Body Dynamics
 // Algorithms", 6.4), and branches are worked on side by side. From the leaves on a step eliminates ends of branches, or ends and
-// their parents (kernels/solver.py, `order_elimination`): a warp waits for its memory once a step. Rows of pivots go through shared
+// their parents (kernels/solver.py, `elimination`): a warp waits for its memory once a step. Rows of pivots go through shared
 // memory: h is symmetric, so each lane writes one number of each. Loops of a warp need constant bounds to be unrolled.
 constexpr int STEPS = $steps, CHAINS = $chains, PARENT[] = {$parents};
 constexpr int STEP[] = {$step}, END[] = {$ends}, NEXT[] = {$nexts}, ROW[] = {$rows};

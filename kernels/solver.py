@@ -93,7 +93,7 @@ class Sizes:
 
     @property
     def elimination(self) -> list[list[tuple[int, int]]]:
-        """Steps of a factorisation: ends of branches, each with its parent where no other branch is left on that, or -1."""
+        """Steps of a factorisation: ends of branches, each with its parent if no other branch is left on that, or -1."""
         steps, left = [], set(range(self.dofs))
         while left:
             on = Counter(self.parents[k] for k in left)
@@ -113,7 +113,8 @@ class Sizes:
         sizes = [[1 + (parent >= 0) for _, parent in step] for step in self.elimination]
         begins = 0, max(map(sum, sizes[::2]))
         ends = [begins[s % 2] + np.cumsum(step) for s, step in enumerate(sizes)]
-        return [(end - size, end) for step, of_step in zip(sizes, ends, strict=True) for size, end in zip(step, of_step)]
+        rows = zip((size for step in sizes for size in step), np.concatenate(ends).tolist(), strict=True)
+        return [(end - size, end) for size, end in rows]
 
     def describe_elimination(self) -> dict[str, Any]:
         """:attr:`elimination` as solver.cu has it, with the rows that a step writes, and who is above whom."""
@@ -131,7 +132,8 @@ class Sizes:
             "leaves": [int(k not in self.parents) for k in range(self.dofs)],
             "above": ["{" + ", ".join(map(str, row)) + "}" for row in above],
         }
-        return {"steps": len(steps), "chains": len(ends)} | {name: ", ".join(map(str, values)) for name, values in lists.items()}
+        texts = {name: ", ".join(map(str, values)) for name, values in lists.items()}
+        return texts | {"steps": len(steps), "chains": len(ends)}
 
     @property
     def stride(self) -> int:

@@ -7,11 +7,13 @@ from collections.abc import Callable, Collection
 from dataclasses import asdict
 from typing import Any
 
+import mujoco_warp
 import newton
 import numpy as np
 import warp as wp
 
 from kernels.actuator_net import make_torques
+from kernels.conditions import BASE as BASE_BODY
 from kernels.conditions import Disturbed, DisturbedStep, ForcedStep, make_begin, make_disturb, make_robot_stage
 from kernels.contact import Poses, collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, to_solver
@@ -108,8 +110,8 @@ class Simulation:
         with wp.ScopedDevice(self.device):
             self.terrain_of_env = wp.array(terrain_of_env, dtype=int)
             self._build_model(builder)
-            self._randomise_model(friction, added_base_mass)
             self._build_solver(cfg or SolverCfg(), file_model)
+            self._randomise_model(friction, added_base_mass)
             self._build_contact(builder)
             self._build_views()
             self._build_conditions()
@@ -123,23 +125,8 @@ class Simulation:
         # it leaves the stiffness of a contact to the robot's file alone.
         weight = {"mujoco:geom_solmix": 0.0}
         scene.add_shape_plane(plane=(0.0, 0.0, 1.0, 0.0), width=0.0, length=0.0, custom_attributes=weight)
-        scene.replicate(builder, self.num_envs)
+        scene.add_world(builder)  # Newton and mujoco_warp set one robot up; all worlds share its numbers
         self.model = scene.finalize()
-
-    def _randomise_model(self, friction: np.ndarray | None, added_base_mass: np.ndarray | None) -> None:
-        model, bodies = self.model, self.model.body_count // self.num_envs
-        if friction is not None:
-            mu = model.shape_material_mu.numpy()
-            mu[1:] = np.repeat(friction, (len(mu) - 1) // self.num_envs)  # the first shape is the ground's
-            model.shape_material_mu.assign(mu)
-        if added_base_mass is not None:
-            mass = model.body_mass.numpy()
-            if not (mass[::bodies] + added_base_mass > 0.0).all():
-                rule = f"added_base_mass must leave some of the base's {mass[0]:g} kg, got {added_base_mass.min():g} kg"
-                raise ValueError(f"{rule}: narrow its range in the robot's training settings")
-            mass[::bodies] += added_base_mass
-            model.body_mass.assign(mass)
-            model.body_inv_mass.assign(1.0 / mass)
 
     def _build_solver(self, cfg: SolverCfg, file_model: Any) -> None:
         impratio = float(file_model.opt.impratio)
@@ -147,11 +134,11 @@ class Simulation:
         rows = file_model.neq + 2 * file_model.nv + int(file_model.geom_condim.max(initial=3)) * self.robot.nconmax
         # By the material's gain kf Newton gives friction a time constant of its own; a negative one leaves it MuJoCo's.
         self.model.shape_material_kf.fill_(-1.0)
+        # Newton counts no contacts, and rows that do not fit have no effect.
+        room = {"njmax": rows, "njmax_nnz": rows * file_model.nv, "nconmax": self.robot.nconmax}
         self.solver = newton.solvers.SolverMuJoCo(
             self.model,
-            njmax=rows,
-            njmax_nnz=rows * file_model.nv,  # Newton counts no contacts, and rows that do not fit have no effect
-            nconmax=self.robot.nconmax,
+            **room,
             iterations=cfg.iterations * (1 if impratio == 1.0 else 2),  # at 100, 8 are as good as any number
             ls_iterations=cfg.ls_iterations,
             cone="elliptic",
@@ -159,6 +146,7 @@ class Simulation:
             impratio=impratio,
             use_mujoco_contacts=False,
             kinematic_switchable_roots=False,
+            separate_worlds=True,
         )
         self.solver.mjw_model.opt.warn_overflow = 0
         # For mujoco_warp's own step: of thousands of robots one always needs the last iteration. A loop that the device
@@ -173,6 +161,36 @@ class Simulation:
         if any(values.numpy()[:6].any() for values in base):
             changed |= newton.ModelFlags.JOINT_DOF_PROPERTIES
         self.solver.notify_model_changed(changed)
+        solver: Any = self.solver
+        solver.mjw_data = mujoco_warp.put_data(solver.mj_model, solver.mj_data, nworld=self.num_envs, **room)
+
+    def _randomise_model(self, friction: np.ndarray | None, added_base_mass: np.ndarray | None) -> None:
+        model = self.solver.mjw_model
+        if self.robot.saturation_effort is not None:  # limits of torques, which follow speeds
+            self._give_rows("actuator_forcerange")
+        if friction is not None:
+            values = self._give_rows("geom_friction")
+            values[:, model.geom_bodyid.numpy() > 0, 0] = friction[:, None]
+            model.geom_friction.assign(values)
+        if added_base_mass is not None:
+            mass = self._give_rows("body_mass")
+            if not (mass[:, BASE_BODY] + added_base_mass > 0.0).all():
+                base = f"{mass[0, BASE_BODY]:g}"
+                rule = f"added_base_mass must leave some of the base's {base} kg, got {added_base_mass.min():g} kg"
+                raise ValueError(f"{rule}: narrow its range in the robot's training settings")
+            mass[:, BASE_BODY] += added_base_mass
+            model.body_mass.assign(mass)
+            for name in ("body_subtreemass", "body_invweight0", "dof_invweight0"):
+                self._give_rows(name)
+            mujoco_warp.set_const(model, self.solver.mjw_data)
+
+    def _give_rows(self, name: str) -> np.ndarray:
+        """Gives an array of mujoco_warp's model a row for each world; returns a copy of its values."""
+        model: Any = self.solver.mjw_model
+        array = getattr(model, name)
+        rows = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
+        setattr(model, name, wp.array(rows, dtype=array.dtype))
+        return rows
 
     def _build_contact(self, builder: newton.ModelBuilder) -> None:
         geoms = self.solver.newton_shape_to_mjc_geom.numpy()  # that of the ground, then those of each robot
@@ -193,9 +211,8 @@ class Simulation:
     def _build_views(self) -> None:
         robot = self.robot
         num_envs = self.num_envs
-        self._state = self.model.state()
-        self.joint_q = self._state.joint_q.reshape((num_envs, -1))
-        self.joint_qd = self._state.joint_qd.reshape((num_envs, -1))
+        self.joint_q = wp.array(np.tile(self.model.joint_q.numpy(), (num_envs, 1)), dtype=float)
+        self.joint_qd = wp.zeros((num_envs, self.model.joint_dof_count), dtype=float)
         self.targets = wp.zeros(self.joint_q.shape, dtype=float)
         self.geom_force = wp.zeros((num_envs, len(robot.geom_names)), dtype=wp.vec3)
         self.joint_torque = self.solver.mjw_data.qfrc_actuator
@@ -222,7 +239,7 @@ class Simulation:
             target_of_actuator=wp.array(7 + np.array(joints, dtype=int), dtype=int),
             base_com=self.base_com,
         )
-        of_robot = bodies[len(bodies) - self.model.body_count // num_envs :]
+        of_robot = bodies[len(bodies) - self.model.body_count :]
         self.poses = make_struct(Poses, solver.mjw_data, column_of_body=wp.array(of_robot, dtype=int))
         # Speed-dependent torque limits and a delay of targets, which ideal drives lack.
         self.motors = None

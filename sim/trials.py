@@ -117,7 +117,7 @@ class _Trial(Rollout):
         sim.launch(self._turn_graph)  # which writes what they observe
         arrays = (self._observation, self.outcome, sim.joint_qd, sim.joint_torque)
         rows, outcome, joint_qd, joint_torque = map(wp.to_torch, arrays)
-        weight = -float(sim.model.gravity.numpy()[0][2]) * float(sim.model.body_mass.numpy().sum()) / self.num_envs
+        weight = -float(sim.model.gravity.numpy()[0][2]) * float(sim.model.body_mass.numpy().sum())
         records: list[torch.Tensor] = []  # a step, shape (num_measures, num_envs)
         for _ in range(round(seconds / robot.control_dt)):
             before = self.side_by_side.output.clone()

@@ -118,7 +118,7 @@ def stand(robot: RobotCfg, *, device: str, seconds: float = 3.0, drops: int = 32
     contacts, overflowed, forces = _let_fall(sim, seconds)
     end = sim.joint_q.numpy()[0].astype(np.float64)
     up = 1.0 - 2.0 * (end[3] ** 2 + end[4] ** 2)
-    weight = float(sim.model.body_mass.numpy()[: len(sim.poses.column_of_body)].sum()) * _GRAVITY
+    weight = float(sim.model.body_mass.numpy().sum()) * _GRAVITY
     on_feet = forces[:, [name in robot.foot_geoms for name in robot.geom_names]] / weight
     shares = zip(robot.geom_names, forces.mean(axis=0) / weight, strict=True)
     bottoms = {name: robot.default_base_height + bottom for name, bottom in bottoms.items()}

@@ -79,10 +79,14 @@ def put(sim: Simulation, joint_q: np.ndarray, joint_qd: np.ndarray | None = None
 
 def present(sim: Simulation, name: str) -> np.ndarray:
     """``body_q`` or ``body_qd`` of Newton's state at the present coordinates, shape (num_envs, num_bodies, ...)."""
-    state: Any = sim._state
-    newton.eval_fk(sim.model, state.joint_q, state.joint_qd, state)
-    values = getattr(state, name).numpy()
-    return values.reshape(sim.num_envs, -1, values.shape[-1])
+    state: Any = sim.model.state()
+    rows = []
+    for joint_q, joint_qd in zip(sim.joint_q.numpy(), sim.joint_qd.numpy(), strict=True):
+        state.joint_q.assign(joint_q)
+        state.joint_qd.assign(joint_qd)
+        newton.eval_fk(sim.model, state.joint_q, state.joint_qd, state)
+        rows.append(getattr(state, name).numpy().copy())
+    return np.array(rows)
 
 
 class Stepper:

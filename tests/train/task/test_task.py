@@ -125,10 +125,10 @@ def test_same_seed_same_numbers(make_task):
 
 def test_load_and_friction_are_drawn_from_their_ranges(make_task):
     # 0.5 to 1.25: of 64 robots the least and the most lie within .05 of the ends (by this seed; the chance is 97 %).
-    model = make_task(num_envs=64, added_base_mass=(2.0, 3.0)).sim.model
-    mass = model.body_mass.numpy().reshape(64, -1)[:, 0]
+    model = make_task(num_envs=64, added_base_mass=(2.0, 3.0)).sim.solver.mjw_model
+    mass = model.body_mass.numpy()[:, 1]
     assert ((mass >= 28.37) & (mass <= 29.38)).all() and len(np.unique(mass)) == 64
-    friction = model.shape_material_mu.numpy()[model.shape_body.numpy() >= 0].reshape(64, -1)
+    friction = model.geom_friction.numpy()[:, model.geom_bodyid.numpy() > 0, 0]
     assert 0.5 <= friction.min() < 0.55 and 1.2 < friction.max() <= 1.25
     assert len(np.unique(friction[:, 0])) == 64
 
