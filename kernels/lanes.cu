@@ -28,5 +28,5 @@ auto find_sine = [](float x, float& sine, float& cosine) {
 const int world = thread / LANES;
 if (robots.parked.data[world] == 2) return;
 constexpr int ALL = LANES == 1 ? 1 : 64;  // a GPU unrolls loops over registers; a CPU does not
-auto row_of = [&](const auto& array) { return array.shape[0] == 1 ? 0 : world; };  // an array has a row for each world, or one for all
+auto row_of = [&](const auto& array) { return array.shape[0] == 1 ? 0 : world; };  // one row for all worlds, or a row for each
 auto model_value = [&](const auto& array, int k) -> const auto& { return wp::index(array, row_of(array), k); };

@@ -93,7 +93,7 @@ class Sizes:
 
     @property
     def elimination(self) -> list[list[tuple[int, int]]]:
-        """Steps of a factorisation: ends of branches, each with its parent if no other branch is left on that, or -1."""
+        """Steps of a factorisation: ends of branches, each with its parent if no branch is left on that, or -1."""
         steps, left = [], set(range(self.dofs))
         while left:
             on = Counter(self.parents[k] for k in left)
