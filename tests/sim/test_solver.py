@@ -1,4 +1,7 @@
-"""Dynamics and step find what mujoco_warp's find, from the same state; torques, randomisation, errors, recording."""
+"""Dynamics and step find what mujoco_warp's find, from the same state; torques, randomisation, errors, recording.
+
+Tests on models that are no robots are slow: mujoco_warp compiles half a hundred kernels for them.
+"""
 
 import gc
 from functools import partial
@@ -206,6 +209,7 @@ def test_every_kind_of_constraint(device, arms, height):
     assert dims == {1, 3, 4, 6}
 
 
+@pytest.mark.slow
 def test_the_order_in_which_contacts_were_found_changes_no_bit(device):
     """Sums over contacts follow their ranks, wherever they lie, in shared memory and beyond."""
     m, d, contacts = everything(device, 31, -0.2)
@@ -276,6 +280,7 @@ def test_robots_that_fall(eight, monkeypatch):
     assert np.mean(iterations) > 1.2
 
 
+@pytest.mark.slow
 def test_worlds_without_rows_and_worlds_that_are_not_finite_end(device):
     m, d, contacts = everything(device)
     d.qvel.zero_()
@@ -303,6 +308,7 @@ def shake(d):
         array.assign((array.numpy() + rng.normal(0.0, spread, array.shape)).astype(np.float32))
 
 
+@pytest.mark.slow
 def test_every_quantity_of_a_step(device):
     """Free and fixed trees, joints of all kinds with springs, actuators of all kinds at and off their limits."""
     m, d, contacts = build(MODEL, device)
@@ -339,6 +345,7 @@ def test_every_quantity_of_a_step(device):
     assert touched > 0
 
 
+@pytest.mark.slow
 def test_the_slope_of_forces_is_that_of_mujoco_warp(device):
     """Without constraints a step is that of the forces alone, and agrees to rounding."""
     m, d, contacts = build(MODEL, device)
@@ -354,6 +361,7 @@ def test_the_slope_of_forces_is_that_of_mujoco_warp(device):
 
 
 @pytest.mark.parametrize("solver", ["Newton", "CG"])
+@pytest.mark.slow
 def test_too_many_contacts_are_noted(device, solver):
     m, d, contacts = build(MODEL, device, option=f'cone="elliptic" solver="{solver}"')
     dynamics = make_ours(m, d, contacts)
@@ -393,6 +401,7 @@ def test_too_many_contacts_are_noted(device, solver):
         {"more": '<equality><joint joint1="elbow" joint2="tail"/></equality>'},
     ],
 )
+@pytest.mark.slow
 def test_other_models_take_their_step(device, parts):
     assert isinstance(make_ours(*build(MODEL, device)), Dynamics)
     assert isinstance(make_ours(*build(MODEL, device, **parts)), StockDynamics)
