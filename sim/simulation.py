@@ -182,7 +182,8 @@ class Simulation:
             model.body_mass.assign(mass)
             for name in ("body_subtreemass", "body_invweight0", "dof_invweight0"):
                 self._give_rows(name)
-            mujoco_warp.set_const(model, self.solver.mjw_data)
+            with self.solver._scoped_mujoco_warp_execution():
+                mujoco_warp.set_const(model, self.solver.mjw_data)
 
     def _give_rows(self, name: str) -> np.ndarray:
         """Gives an array of mujoco_warp's model a row for each world; returns a copy of its values."""
