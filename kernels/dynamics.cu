@@ -100,6 +100,7 @@ if (lane == 0) {
     put_six(force, 0, six(Vec(), -gravity));  // as if the world accelerated upward
     for (int i = 0; i < 10; ++i) inertia[i] = 0.0f;
 }
+static_assert($num_floats % 4 == 0, "the second robot of a block would lie askew");
 Link links[LINKS];
 #pragma unroll ALL
 for (int k = 0; k < LINKS; ++k) {

@@ -113,7 +113,8 @@ class TreeSizes:
     @property
     def shared_floats(self) -> int:
         """Floats of shared memory that a robot needs."""
-        return 32 * self.bodies + self.coordinates + 13 * self.dofs + self.actuators
+        floats = 32 * self.bodies + self.coordinates + 13 * self.dofs + self.actuators
+        return -(-floats // 4) * 4  # robots of a block lie behind each other, and vectors are read whole
 
 
 @cache

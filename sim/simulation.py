@@ -182,6 +182,7 @@ class Simulation:
             model.body_mass.assign(mass)
             for name in ("body_subtreemass", "body_invweight0", "dof_invweight0"):
                 self._give_rows(name)
+            # Enough as limits have solref of their own, and there are no tendons and no connects.
             with self.solver._scoped_mujoco_warp_execution():
                 mujoco_warp.set_const(model, self.solver.mjw_data)
 

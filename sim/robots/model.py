@@ -20,7 +20,7 @@ _vec2: Any = wp.vec2
 
 
 def build_robot(robot: RobotCfg) -> newton.ModelBuilder:
-    """One robot as a Newton builder without visual shapes, ready to be replicated into worlds."""
+    """One robot as a Newton builder without visual shapes, ready for a scene."""
     return make_builder(robot_spec(robot).compile())
 
 

@@ -1,7 +1,8 @@
 """The GPU's code of dynamics and solver on a CPU: a thread for each lane of a warp, and a barrier where lanes wait.
 
-Shared memory begins as NaN, so that what nobody wrote is seen, and threads are not in step as lanes mostly are: where a
-lane reads what another one wrote without a barrier between, the numbers differ.
+Shared memory begins as NaN, so that what nobody wrote is seen, and it is that of the second world of a block, so that
+what lies askew ends the test. Threads are not in step as lanes mostly are: a barrier that is missing changes numbers,
+unless a shuffle is there, which waits here.
 """
 
 import ctypes
@@ -27,8 +28,8 @@ pytestmark = [
 HEADERS = "".join(f"#include <{name}>\n" for name in ("barrier", "cmath", "cstring", "thread", "vector"))
 LANES = """
 constexpr int LANES = {lanes};
-static float pool[{floats} + 4];
-float* const memory = (float*)(((size_t)pool + 15) / 16 * 16);
+alignas(16) static float pool[2 * {floats}];
+float* const memory = pool + {floats};
 for (int k = 0; k < {floats}; ++k) memory[k] = NAN;
 std::barrier<> together(LANES);
 double bus[LANES];
@@ -74,6 +75,7 @@ def run_by_lanes(kernel, body: Path, lanes: int, floats: int, folder: Path) -> N
     file.write_text(HEADERS + source)
     native = Path(wp.__file__).with_name("native")
     options = ["-std=c++20", "-O1", "-shared", "-fPIC", "-pthread", "-w", "-fpermissive", "-I", native]
+    options += ["-fsanitize=alignment", "-fno-sanitize-recover"]
     subprocess.run(["g++", *options, file, "-o", file.with_suffix(".so")], check=True)
     library = ctypes.CDLL(str(file.with_suffix(".so")), mode=ctypes.RTLD_GLOBAL)
     loaded.get_kernel_hooks(kernel).forward = getattr(library, f"{name}_cpu_forward")
