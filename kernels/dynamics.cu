@@ -23,6 +23,7 @@ float* rotation = position + NB * 3;  // NB x 4, wxyz
 float* com = rotation + NB * 4;       // NB x 3: mass centre of a tree, at its root
 float* qpos = com + NB * 3;           // NQ, then NV of qvel and NU of ctrl
 float *qvel = qpos + NQ, *ctrl = qvel + NV;
+static_assert($num_floats % 4 == 0, "the second robot of a block would lie askew");
 
 auto get = [](const float* array, int k) { return Vec(array[3 * k], array[3 * k + 1], array[3 * k + 2]); };
 auto put = [](float* array, int k, const Vec& v) { array[3 * k] = v[0]; array[3 * k + 1] = v[1]; array[3 * k + 2] = v[2]; };
@@ -100,7 +101,6 @@ if (lane == 0) {
     put_six(force, 0, six(Vec(), -gravity));  // as if the world accelerated upward
     for (int i = 0; i < 10; ++i) inertia[i] = 0.0f;
 }
-static_assert($num_floats % 4 == 0, "the second robot of a block would lie askew");
 Link links[LINKS];
 #pragma unroll ALL
 for (int k = 0; k < LINKS; ++k) {

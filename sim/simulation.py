@@ -163,11 +163,11 @@ class Simulation:
         self.solver.notify_model_changed(changed)
         solver: Any = self.solver
         solver.mjw_data = mujoco_warp.put_data(solver.mj_model, solver.mj_data, nworld=self.num_envs, **room)
+        if self.robot.saturation_effort is not None:  # limits of torques, which follow speeds
+            self._give_rows("actuator_forcerange")
 
     def _randomise_model(self, friction: np.ndarray | None, added_base_mass: np.ndarray | None) -> None:
         model = self.solver.mjw_model
-        if self.robot.saturation_effort is not None:  # limits of torques, which follow speeds
-            self._give_rows("actuator_forcerange")
         if friction is not None:
             values = self._give_rows("geom_friction")
             values[:, model.geom_bodyid.numpy() > 0, 0] = friction[:, None]
