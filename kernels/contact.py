@@ -12,8 +12,11 @@ import warp as wp
 
 from kernels.ground import FIRM, Ground, patch_at
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
-from kernels.launch import kernel_over, make_zeros
+from kernels.launch import kernel_over, launch_grid, least_float_of_lanes, least_of_lanes, make_zeros
 
+LANES = 8
+"""Threads of a GPU that share the probes of a strip."""
+_NONE = wp.constant(2**30)
 vec5 = wp.types.vector(5, float)
 """MuJoCo's frictions of a contact, or an impedance."""
 
@@ -93,11 +96,13 @@ class Surfaces:
 
 @wp.func
 def _write_contact(
-    contacts: Contacts, slot: int, rank: int, strip: int, centre: wp.vec3, point: SurfacePoint, ground: Ground, t: int,
-    env: int, probes: Probes,
+    contacts: Contacts, rank: int, strip: int, probe: int, point: SurfacePoint, pose: wp.transform, ground: Ground,
+    t: int, env: int, probes: Probes,
 ):  # fmt: skip
+    slot = wp.atomic_add(contacts.count, env, 1)
     if slot < contacts.shape.shape[1]:
         radius = probes.strip_radius[strip]
+        centre = wp.transform_point(pose, probes.position[probe])
         touched = centre - point.normal * point.distance
         contacts.rank[env, slot] = rank
         contacts.shape[env, slot] = probes.strip_shape[strip]
@@ -116,8 +121,8 @@ def _write_contact(
 
 @wp.func
 def _collide_strip(
-    pose: wp.transform, strip: int, terrain: Terrain, ground: Ground, t: int, env: int, probes: Probes,
-    contacts_out: Contacts,
+    pose: wp.transform, strip: int, lane: int, lanes: int, terrain: Terrain, ground: Ground, t: int, env: int,
+    probes: Probes, contacts_out: Contacts,
 ):  # fmt: skip
     radius = probes.strip_radius[strip]
     begin = probes.strip_start[strip]
@@ -131,37 +136,41 @@ def _collide_strip(
     ceiling = ceiling_over(terrain, t, lower, upper)
     if not (lowest < ceiling):
         return
-    first = int(-1)
+    first = int(_NONE)
     last = int(-1)
-    deepest = int(-1)
-    depth = float(0.0)
-    point = SurfacePoint()
+    deepest = int(_NONE)
+    least = float(radius)
+    of_first = SurfacePoint()
+    of_last = SurfacePoint()
     of_deepest = SurfacePoint()
-    for k in range(begin, end):
+    for k in range(begin + lane, end, lanes):
         centre = wp.transform_point(pose, probes.position[k])
         if centre[2] - radius < ceiling:
             point = nearest_surface_point(terrain, t, centre, radius)
-        else:
-            point.distance = radius
-        if point.distance < radius:
-            if first < 0:
-                first = k
-            last = k
-            if radius - point.distance > depth:
-                depth = radius - point.distance
-                deepest = k
-                of_deepest = point
-    if first < 0:
+            if point.distance < radius:
+                if last < 0:
+                    first = k
+                    of_first = point
+                last = k
+                of_last = point
+                if point.distance < least:
+                    least = point.distance
+                    deepest = k
+                    of_deepest = point
+    first_of_all = least_of_lanes(first, lanes)
+    if first_of_all == _NONE:
         return
-    count = 1 + int(first != deepest) + int(last != deepest)
-    slot = wp.atomic_add(contacts_out.count, env, count)
-    for nth in range(count):
-        probe = wp.where(nth == 0, deepest, wp.where(nth == 1 and first != deepest, first, last))
-        centre = wp.transform_point(pose, probes.position[probe])
-        point = of_deepest
-        if nth > 0:
-            point = nearest_surface_point(terrain, t, centre, radius)
-        _write_contact(contacts_out, slot + nth, 3 * strip + nth, strip, centre, point, ground, t, env, probes)
+    last_of_all = -least_of_lanes(-last, lanes)
+    if least_float_of_lanes(least, lanes) < least:
+        deepest = _NONE
+    deepest_of_all = least_of_lanes(deepest, lanes)
+    rank = 3 * strip
+    if deepest == deepest_of_all:
+        _write_contact(contacts_out, rank, strip, deepest, of_deepest, pose, ground, t, env, probes)
+    if first == first_of_all and first != deepest_of_all:
+        _write_contact(contacts_out, rank + 1, strip, first, of_first, pose, ground, t, env, probes)
+    if last == last_of_all and last != deepest_of_all:
+        _write_contact(contacts_out, rank + 2, strip, last, of_last, pose, ground, t, env, probes)
 
 
 @wp.kernel
@@ -172,10 +181,11 @@ def _collide_strips_kernel(
     probes: Probes,
     ground: Ground,
     parked: wp.array[int],
+    lanes: int,
     contacts_out: Contacts,
 ):
-    """Grid (num_bundles, num_envs): the threads of a warp look at the same part of different robots."""
-    bundle, env = wp.tid()
+    """Grid (num_bundles, num_envs, lanes): the threads of a warp look at the same part of different robots."""
+    bundle, env, lane = wp.tid()
     if parked[env] == 2:
         return
     t = terrain_of_env[env]
@@ -189,7 +199,7 @@ def _collide_strips_kernel(
     if not (middle[2] - ball[3] < ceiling_over(terrain, t, lower, upper)):
         return  # also where the state is NaN
     for strip in range(probes.bundle_start[bundle], probes.bundle_start[bundle + 1]):
-        _collide_strip(pose, strip, terrain, ground, t, env, probes, contacts_out)
+        _collide_strip(pose, strip, lane, lanes, terrain, ground, t, env, probes, contacts_out)
 
 
 def collide_strips(
@@ -200,9 +210,10 @@ def collide_strips(
     Without arrays the ground is the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
     """
     contacts.count.zero_()
-    inputs = [poses, terrain_of_env, terrain, probes, ground, parked, contacts]
-    size = (len(probes.bundle_body), len(terrain_of_env))
-    wp.launch(_collide_strips_kernel, size, inputs, device=terrain_of_env.device)
+    device = terrain_of_env.device
+    lanes = 1 if device.is_cpu else LANES
+    inputs = [poses, terrain_of_env, terrain, probes, ground, parked, lanes, contacts]
+    launch_grid(_collide_strips_kernel, (len(probes.bundle_body), len(terrain_of_env), lanes), inputs, device)
 
 
 def make_contacts(num_envs: int, capacity: int) -> Contacts:

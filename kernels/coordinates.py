@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from kernels.contact import Contacts, Surfaces, vec5
-from kernels.launch import kernel_over
+from kernels.launch import kernel_over, launch_grid
 from kernels.state import base_ang_vel_b, base_rotation, velocity_beside
 
 
@@ -99,7 +99,7 @@ def to_solver(joint_q: Any, joint_qd: Any, targets: Any, delay_out: Delay, solve
     """Write coordinates, velocities and the targets in effect to mujoco_warp's data."""
     threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
     inputs = [joint_q, joint_qd, targets, delay_out, solver_out]
-    wp.launch(_to_solver_kernel, (len(joint_q), threads), inputs, device=joint_q.device)
+    launch_grid(_to_solver_kernel, (len(joint_q), threads), inputs, joint_q.device)
 
 
 @kernel_over("ranges_out")
@@ -145,7 +145,7 @@ def _from_solver_kernel(solver: SolverState, joint_q_out: wp.array2d[float], joi
 def from_solver(solver: SolverState, joint_q_out: Any, joint_qd_out: Any) -> None:
     """Read coordinates and velocities from mujoco_warp's data."""
     size = (len(joint_q_out), 1 + len(solver.column_of_joint))
-    wp.launch(_from_solver_kernel, size, [solver, joint_q_out, joint_qd_out], device=joint_q_out.device)
+    launch_grid(_from_solver_kernel, size, [solver, joint_q_out, joint_qd_out], joint_q_out.device)
 
 
 @wp.struct

@@ -185,7 +185,7 @@ for (int n = 0; n < tree.roots.shape[0]; ++n) {
         const Link& link = links[k];
         if (link.level >= 0 && link.root == root) sum += link.centre * model_value(tree.body_mass, link.body);
     }
-    for (int i = 0; i < 3; ++i) sum[i] = total(sum[i]);
+    add_lanes(sum[0], sum[1], sum[2]);
     const float mass = model_value(tree.body_subtreemass, root);
     if (mass != 0.0f) sum = sum / mass;
     if (lane == 0) {

@@ -7,10 +7,10 @@ __shared__ alignas(16) float pool[$worlds * $num_floats];
 float* memory = pool + threadIdx.x / LANES * $num_floats;
 auto sync = [&] { __syncwarp(lanes_mask); };
 auto shuffle = [&](auto x, int k) { return __shfl_sync(lanes_mask, x, k, LANES); };  // the x of lane k
-// The same bits in all lanes: a fused multiply-add would round differently from lane to lane.
-auto total = [&](float x) {
-    for (int k = LANES / 2; k > 0; k /= 2) x = __fadd_rn(x, __shfl_xor_sync(lanes_mask, x, k));
-    return x;
+// Sums over the lanes of several numbers at once, so that none waits for another. The same bits in all lanes: a fused
+// multiply-add would round differently from lane to lane.
+auto add_lanes = [&](auto&... x) {
+    for (int k = LANES / 2; k > 0; k /= 2) ((x = __fadd_rn(x, __shfl_xor_sync(lanes_mask, x, k))), ...);
 };
 auto find_sine = [](float x, float& sine, float& cosine) { sincosf(x, &sine, &cosine); };
 #else
@@ -19,7 +19,7 @@ const int lane = 0;
 alignas(16) float memory[$num_floats];
 auto sync = [] {};
 auto shuffle = [](auto x, int) { return x; };
-auto total = [](float x) { return x; };
+auto add_lanes = [](auto&...) {};
 auto find_sine = [](float x, float& sine, float& cosine) {
     sine = wp::sin(x);
     cosine = wp::cos(x);

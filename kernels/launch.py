@@ -5,7 +5,7 @@ such kernels are C++ (``.cu`` files), for shuffles and barriers, which Warp's la
 warp, so that a world that is done early frees its multiprocessor.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from inspect import signature
 from operator import attrgetter
 from pathlib import Path
@@ -16,8 +16,34 @@ from typing import Any
 import warp as wp
 
 _WARP = 32
+BLOCK = 64
+"""Threads of a block of a grid: few, so that a small grid reaches all multiprocessors."""
 _BLOCK_FLOATS = 12 * 1024  # 48 KiB: what a block may have without asking
+_LEAST = """
+#if defined(__CUDA_ARCH__)
+const unsigned others = ((1u << lanes) - 1u) << (threadIdx.x % 32 / lanes * lanes);
+for (int k = lanes / 2; k > 0; k /= 2) x = wp::min(x, __shfl_xor_sync(others, x, k));
+#endif
+return x;
+"""
 _PROLOGUE = Path(__file__).with_name("lanes.cu")
+
+
+def launch_grid(kernel: Any, size: int | tuple[int, ...], inputs: Sequence[Any], device: Any) -> None:
+    """Launch a kernel of so many threads in blocks of :data:`BLOCK`."""
+    wp.launch(kernel, size, inputs=inputs, device=device, block_dim=BLOCK)
+
+
+@wp.func_native(_LEAST)
+def least_of_lanes(x: int, lanes: int) -> int:
+    """Least x of ``lanes`` threads beside each other, a power of 2 up to 16 on a GPU and 1 on a CPU; all must call it."""
+    ...
+
+
+@wp.func_native(_LEAST)
+def least_float_of_lanes(x: float, lanes: int) -> float:
+    """The same of floats."""
+    ...
 
 
 def kernel_over(array: str, **options: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -33,7 +59,7 @@ def kernel_over(array: str, **options: Any) -> Callable[[Callable[..., None]], C
 
         def launch_kernel(*arguments: Any) -> None:
             over = attrgetter(array)(SimpleNamespace(**dict(zip(names, arguments, strict=True))))
-            wp.launch(kernel, over.shape, inputs=arguments, device=over.device)
+            launch_grid(kernel, over.shape, arguments, over.device)
 
         launch_kernel.__doc__ = function.__doc__
         return launch_kernel

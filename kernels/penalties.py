@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from kernels.launch import kernel_over
+from kernels.launch import launch_grid
 from kernels.state import RobotStep, base_ang_vel_b, base_lin_vel_b
 
 BASE = 1
@@ -193,17 +193,18 @@ def _collision(step: RobotStep, env: int) -> float:
 
 
 @cache
-def _make_launcher(functions: tuple[Any, ...]) -> Callable[..., None]:
+def _make_kernel(functions: tuple[Any, ...]) -> Any:
     count = len(functions)
     options = {"max_unroll": max(16, count)}  # the loop calls another function each time
 
-    @kernel_over("counted", module="unique", module_options=options)
+    @wp.kernel(module="unique", module_options=options)
     def add_penalties(step: RobotStep, dt: float, counted: wp.array[int], sums_out: wp.array2d[float]):
-        """Grid (num_envs,)."""
-        env = wp.tid()
+        """Grid (num_penalties, num_envs)."""
+        column, env = wp.tid()
         if counted[env] != 0:
             for k in range(wp.static(count)):
-                sums_out[env, k] += dt * wp.static(functions[k])(step, env)
+                if k == column:
+                    sums_out[env, k] += dt * wp.static(functions[k])(step, env)
 
     return add_penalties
 
@@ -213,4 +214,5 @@ def add_penalties(step: RobotStep, dt: float, counted: Any, sums_out: Any) -> No
 
     Where the int ``counted`` (num_envs,) is 0, nothing is added.
     """
-    _make_launcher(tuple(entry.function for entry in PENALTIES.values()))(step, dt, counted, sums_out)
+    kernel = _make_kernel(tuple(entry.function for entry in PENALTIES.values()))
+    launch_grid(kernel, sums_out.shape[::-1], [step, dt, counted, sums_out], sums_out.device)

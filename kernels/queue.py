@@ -15,7 +15,7 @@ import warp as wp
 
 from kernels.episode import SEGMENTS, STEERING, Episodes, Outcome, begin_episode
 from kernels.heightfield import Terrain, node_height
-from kernels.launch import kernel_over, make_zeros
+from kernels.launch import kernel_over, launch_grid, make_zeros
 from kernels.observation import Sensors
 from kernels.rewards import Rewards
 from kernels.state import RobotStep, velocity_beside
@@ -253,4 +253,4 @@ def _clear_rows_kernel(mask: wp.array[int], stride: int, rows_out: wp.array2d[fl
 def clear_rows(mask: Any, rows_out: Any) -> None:
     """Set the rows of ``rows_out`` (num_envs, num_columns) to zero where the int ``mask`` (num_envs,) is not 0."""
     stride = min(_CLEARING_THREADS, rows_out.shape[1])
-    wp.launch(_clear_rows_kernel, (len(mask), stride), [mask, stride, rows_out], device=rows_out.device)
+    launch_grid(_clear_rows_kernel, (len(mask), stride), [mask, stride, rows_out], rows_out.device)

@@ -2,7 +2,7 @@ struct Point { float cost, slope, curve; };
 struct Spring { float stiffness, damping, impedance; };
 constexpr int NV = $dofs, DIM = $dimensions, NUM_SHARED = $num_shared, LD = $stride, CHUNK = $chunk;
 constexpr int PER_LANE = (NV + LANES - 1) / LANES;  // a lane has dof `lane` and every LANES-th after it
-constexpr bool HAS_LOSSES = $losses;
+constexpr bool HAS_LOSSES = $losses, SPILLS = $spills;  // SPILLS: there may be more contacts than fit into shared memory
 constexpr float MINVAL = ${minval}f, EPS = 8.0f * 1.1920929e-07f;
 enum { SATISFIED, QUADRATIC, CONE };
 struct alignas(16) Float4 { float v[4]; };
@@ -24,8 +24,10 @@ Contact* shared_contacts = (Contact*)(coefficient + (CHUNK * DIM * DIM + 3) / 4 
 constexpr int NUM_FLOATS = (NV + 1 + $part_rows) * LD + (CHUNK * DIM * DIM + 3) / 4 * 4 + NUM_SHARED * sizeof(Contact) / 4;
 static_assert(NUM_FLOATS == $num_floats, "kernels/solver.py counts memory otherwise");
 Contact* spilled_contacts = (Contact*)&wp::index(problem.spilled_contacts, world, 0);
-auto get_contact = [&](int c) -> Contact& { return c < NUM_SHARED ? shared_contacts[c] : spilled_contacts[c - NUM_SHARED]; };
-const int capacity = problem.contacts.shape.shape[1];  // no constant: a robot with room for more has the same kernel
+auto get_contact = [&](int c) -> Contact& {
+    return !SPILLS || c < NUM_SHARED ? shared_contacts[c] : spilled_contacts[c - NUM_SHARED];
+};
+const int capacity = problem.contacts.shape.shape[1];  // no constant: robots with room for more have one kernel
 const int num_found = problem.contacts.count.data[world], num_contacts = wp::min(num_found, capacity);
 const float dt = wp::index(problem.timestep, row_of(problem.timestep));
 const float root_impratio = wp::index(problem.impratio_invsqrt, row_of(problem.impratio_invsqrt));
@@ -435,7 +437,7 @@ auto evaluate_loss = [](float d, float max_force, float x, float v) {
 constexpr int READ = LANES == 1 ? 64 : 1;  // contacts of a search that a CPU keeps; a lane keeps its first
 Line lines[READ];
 float gauss_slope, gauss_curve;  // inertia gives a parabola
-// `first` reads the contacts and computes the constraints' cost at 0.
+// `first`, at 0, reads the contacts, computes the constraints' cost, and adds up the lanes' parts of the parabola.
 auto evaluate_line = [&](float alpha, bool first, float& cost0) {
     Point sum = {0.0f, 0.0f, 0.0f};
     float before = 0.0f;
@@ -468,23 +470,25 @@ auto evaluate_line = [&](float alpha, bool first, float& cost0) {
             add(evaluate_loss(loss_d[m], loss[m], x + alpha * search[m], search[m]));
         }
     }
-    if (first) cost0 = total(before);
+    if (first) {
+        add_lanes(before, sum.slope, sum.curve, gauss_slope, gauss_curve);
+        cost0 = before;
+    } else {
+        add_lanes(sum.cost, sum.slope, sum.curve);
+    }
     return Point{
-        total(sum.cost) + alpha * (alpha * gauss_curve + gauss_slope),
-        total(sum.slope) + 2.0f * alpha * gauss_curve + gauss_slope,
-        total(sum.curve) + 2.0f * gauss_curve
+        sum.cost + alpha * (alpha * gauss_curve + gauss_slope), sum.slope + 2.0f * alpha * gauss_curve + gauss_slope,
+        sum.curve + 2.0f * gauss_curve
     };
 };
 // Newton steps from both ends of a bracket and from its middle, until the slope is nearly 0. Returns false at the iteration cap.
 auto search_line = [&](const LaneVector& mv, float search_dot, float scale, float& alpha, float& gained) {
-    float slope = 0.0f, curve = 0.0f;
+    gauss_slope = gauss_curve = 0.0f;
     #pragma unroll ALL
     for (int m = 0; m < PER_LANE; ++m) {
-        slope += search[m] * (momentum[m] - smooth[m]);
-        curve += 0.5f * search[m] * mv[m];
+        gauss_slope += search[m] * (momentum[m] - smooth[m]);
+        gauss_curve += 0.5f * search[m] * mv[m];
     }
-    gauss_slope = total(slope);
-    gauss_curve = total(curve);
     const float flat = wp::max(tolerance * ls_tolerance * wp::sqrt(search_dot) / scale, 1e-6f);
     auto between = [](const Point& x, const Point& y) {
         return (x.slope < y.slope && y.slope < 0.0f) || (x.slope > y.slope && y.slope > 0.0f);
@@ -647,7 +651,8 @@ for (int m = 0; m < PER_LANE; ++m) {
         loss_aref[m] = -s.damping * speed[m];
     }
 }
-const float scale = 1.0f / wp::max(MINVAL, total(trace));
+add_lanes(trace);
+const float scale = 1.0f / wp::max(MINVAL, trace);
 #pragma unroll 1
 for (int begin = 0; begin < num_contacts; begin += LANES) {
     if (begin > 0) found = read_found(begin);
@@ -734,7 +739,7 @@ while (true) {
             gradient[m] = momentum[m] - smooth[m] - constraint[m];
             squares += gradient[m] * gradient[m];
         }
-        squares = total(squares);
+        add_lanes(squares);
         // mujoco_warp's test, made before the Hessian that a robot that is done would not need.
         done = iteration > 0 && (alpha == 0.0f || (scale * gained > 0.0f && scale * gained < tolerance)
             || scale * wp::sqrt(squares) < tolerance);
@@ -770,8 +775,8 @@ while (true) {
         dot += search[m] * search[m];
         along -= gradient[m] * search[m];
     }
-    const float search_dot = total(dot), decrement = total(along);
-    done = iteration > 0 && scale * 0.5f * decrement < tolerance;
+    add_lanes(dot, along);
+    done = iteration > 0 && scale * 0.5f * along < tolerance;
     if (!done && iteration == problem.iterations) {
         bits |= $too_many;
         done = true;
@@ -786,7 +791,7 @@ while (true) {
         contact.jv[r % DIM] = product(contact.jacobian[r % DIM], vector);
     }
     sync();
-    if (!search_line(mv, search_dot, scale, alpha, gained)) bits |= $too_many_on_line;
+    if (!search_line(mv, dot, scale, alpha, gained)) bits |= $too_many_on_line;
     #pragma unroll ALL
     for (int m = 0; m < PER_LANE; ++m) {
         qacc[m] += alpha * search[m];

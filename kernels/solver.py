@@ -166,8 +166,8 @@ class Sizes:
 
 
 @cache
-def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
-    values = asdict(sizes) | dict(codes) | {"losses": str(sizes.losses).lower()}
+def _kernel(sizes: Sizes, spills: bool, codes: tuple[tuple[str, Any], ...]) -> Any:
+    values = asdict(sizes) | dict(codes) | {"losses": str(sizes.losses).lower(), "spills": str(spills).lower()}
     values |= {"chunk": _CHUNK, "num_shared": sizes.shared_contacts, "stride": sizes.stride, "dofs": sizes.dofs}
     values |= {"part_rows": sizes.part_rows} | sizes.describe_elimination()
     snippet = fill_snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **values)
@@ -193,5 +193,6 @@ def step_robots(robots: Robots, problem: Problem, sizes: Sizes, codes: dict[str,
     ``codes`` are MuJoCo's numbers, by their names in solver.cu: the type of a free joint, overflow bits, limits of
     impedances, the smallest divisor.
     """
-    kernel = _kernel(sizes, tuple(codes.items()))
+    spills = problem.contacts.shape.shape[1] > sizes.shared_contacts
+    kernel = _kernel(sizes, spills, tuple(codes.items()))
     launch_lanes(kernel, len(robots.qvel), [robots, problem], lanes=LANES, device=robots.qvel.device)

@@ -262,8 +262,8 @@ class Rollout:
         stepped = self._stepped.outcome
         apply_action(self._action, sensors, self.robot.action_scale, self._last_action, sim.targets)
         park_ended(stepped, sensors.default_joint_pos, sim.joint_q, sim.joint_qd, sim.targets, sim.parked)
-        for _ in range(self.robot.decimation):
-            sim.physics_step()
+        for k in range(self.robot.decimation):
+            sim.physics_step(follows=k > 0)
             sim.read_geom_forces()
             for task, episode in self._latches:
                 latch_outcomes(self._robot_step, task, episode)

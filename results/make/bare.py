@@ -85,8 +85,8 @@ class Motion:
         """Physics steps of the robots that are not left out, in one replay of all segments."""
 
         def control_step() -> None:
-            for _ in range(sim.robot.decimation):
-                sim.physics_step()
+            for k in range(sim.robot.decimation):
+                sim.physics_step(follows=k > 0)
             if beside is not None:
                 beside()
 

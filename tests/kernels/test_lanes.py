@@ -43,9 +43,8 @@ auto shuffle = [&](auto x, int k) {{
     sync();
     return x;
 }};
-auto total = [&](float x) {{
-    for (int k = LANES / 2; k > 0; k /= 2) x += shuffle(x, lane ^ k);
-    return x;
+auto add_lanes = [&](auto&... x) {{
+    for (int k = LANES / 2; k > 0; k /= 2) ((x += shuffle(x, lane ^ k)), ...);
 }};
 auto find_sine = [](float x, float& sine, float& cosine) {{
     sine = sinf(x);

@@ -430,6 +430,21 @@ def test_torque_is_the_pd_law_and_clamped(eight, robot):
     assert not torque[:, :6].any()  # nothing drives the base
 
 
+def test_a_step_that_follows_another_takes_up_its_state(eight):
+    eight.bank.set_heights(np.zeros(eight.bank.heights.shape, np.float32))
+    q, qd = standing(eight.robot, 8, z=1.5), np.random.default_rng(3).normal(0.0, 0.7, eight.joint_qd.shape)
+    ends = []
+    for follows in (False, True):
+        put(eight, q, qd)
+        with wp.ScopedDevice(eight.device):
+            for step in range(20):
+                eight.physics_step(follows=follows and step > 0)
+        ends.append([array.numpy().copy() for array in (eight.joint_q, eight.joint_qd)])
+    for plain, following in zip(*ends, strict=True):
+        np.testing.assert_allclose(following, plain, atol=2e-4)
+    assert np.abs(ends[1][0] - q).max() > 0.1
+
+
 def test_friction_and_mass_of_each_robot(anymal, device):
     # Three robots on the same ground: they weigh 47.13, 52.13 and 57.13 kg, and every contact has its robot's friction.
     bank = TerrainBank(1, device=device)

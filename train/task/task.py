@@ -155,7 +155,7 @@ class CommandTask:
         sim, episodes, training = self.sim, self._episodes, self._training
         apply_action(training.action, sim.sensors, self.robot.action_scale, training.last_action, sim.targets)
         for step in range(1, self.robot.decimation + 1):
-            sim.physics_step()
+            sim.physics_step(follows=step > 1)
             # A crossing ends at the first touch of the base, however short; other outcomes are checked once a step.
             if self.cfg.crosses and step < self.robot.decimation:
                 sim.read_geom_forces()
