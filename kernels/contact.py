@@ -6,27 +6,16 @@ Of the probes of a strip that touch, the first, the deepest and the last become 
 two ends and on the highest point between, and a robot on its back cannot flood the solver.
 """
 
+import math
 from typing import Any
 
 import warp as wp
 
 from kernels.ground import FIRM, Ground, patch_at
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
-from kernels.launch import (
-    WARP,
-    kernel_over,
-    launch_grid,
-    least_float_of_lanes,
-    least_of_lanes,
-    lowest_vote,
-    make_zeros,
-    vote,
-)
+from kernels.launch import kernel_over, launch_grid, least_float_of_lanes, least_of_lanes, make_zeros
 
-LANES = 8
-"""Threads of a GPU that share the probes of a strip."""
-_ROBOTS = 16  # of a warp
-_FEW = 2**16  # parts of robots, of which a warp has 4
+_MAX_THREADS = 150_000  # of a GPU: while there are no more, several threads share the probes of a strip
 _NONE = wp.constant(2**30)
 vec5 = wp.types.vector(5, float)
 """MuJoCo's frictions of a contact, or an impedance."""
@@ -184,12 +173,6 @@ def _collide_strip(
         _write_contact(contacts_out, rank + 2, strip, last, of_last, pose, ground, t, env, probes)
 
 
-@wp.func
-def _pose_of(poses: Poses, env: int, column: int) -> wp.transform:
-    wxyz = poses.xquat[env, column]
-    return wp.transform(poses.xpos[env, column], wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
-
-
 @wp.kernel
 def _collide_strips_kernel(
     poses: Poses,
@@ -198,40 +181,25 @@ def _collide_strips_kernel(
     probes: Probes,
     ground: Ground,
     parked: wp.array[int],
-    robots: int,
-    groups: int,
     lanes: int,
     contacts_out: Contacts,
 ):
-    """Grid (num_bundles, num_envs / robots, a warp).
-
-    The warp looks at the same part of so many robots, with a thread each, and then, in ``groups`` of ``lanes`` threads,
-    at those of which it is near the ground.
-    """
-    bundle, nth, thread = wp.tid()
+    """Grid (num_bundles, num_envs, lanes): the threads of a warp look at the same part of different robots."""
+    bundle, env, lane = wp.tid()
+    if parked[env] == 2:
+        return
+    t = terrain_of_env[env]
     column = poses.column_of_body[probes.bundle_body[bundle]]
+    wxyz = poses.xquat[env, column]
+    pose = wp.transform(poses.xpos[env, column], wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
     ball = probes.bundle_ball[bundle]
-    first = nth * robots
-    is_near = bool(False)
-    if thread < robots and first + thread < parked.shape[0] and parked[first + thread] != 2:
-        middle = wp.transform_point(_pose_of(poses, first + thread, column), wp.vec3(ball[0], ball[1], ball[2]))
-        lower = wp.vec2(middle[0] - ball[3], middle[1] - ball[3])
-        upper = wp.vec2(middle[0] + ball[3], middle[1] + ball[3])
-        # False where the state is NaN.
-        is_near = middle[2] - ball[3] < ceiling_over(terrain, terrain_of_env[first + thread], lower, upper)
-    left = vote(is_near)
-    while left != 0:
-        chosen = left
-        for _ in range(thread // lanes):
-            chosen = chosen & (chosen - 1)
-        if chosen != 0:
-            env = first + lowest_vote(chosen)
-            t = terrain_of_env[env]
-            pose = _pose_of(poses, env, column)
-            for strip in range(probes.bundle_start[bundle], probes.bundle_start[bundle + 1]):
-                _collide_strip(pose, strip, thread % lanes, lanes, terrain, ground, t, env, probes, contacts_out)
-        for _ in range(groups):
-            left = left & (left - 1)
+    middle = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
+    lower = wp.vec2(middle[0] - ball[3], middle[1] - ball[3])
+    upper = wp.vec2(middle[0] + ball[3], middle[1] + ball[3])
+    if not (middle[2] - ball[3] < ceiling_over(terrain, t, lower, upper)):
+        return  # also where the state is NaN
+    for strip in range(probes.bundle_start[bundle], probes.bundle_start[bundle + 1]):
+        _collide_strip(pose, strip, lane, lanes, terrain, ground, t, env, probes, contacts_out)
 
 
 def collide_strips(
@@ -242,12 +210,11 @@ def collide_strips(
     Without arrays the ground is the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
     """
     contacts.count.zero_()
-    device, num_bundles, num_envs = terrain_of_env.device, len(probes.bundle_body), len(terrain_of_env)
-    robots, groups, lanes = (4 if num_bundles * num_envs < _FEW else _ROBOTS), WARP // LANES, LANES
-    if device.is_cpu:
-        robots = groups = lanes = 1
-    inputs = [poses, terrain_of_env, terrain, probes, ground, parked, robots, groups, lanes, contacts]
-    launch_grid(_collide_strips_kernel, (num_bundles, -(-num_envs // robots), groups * lanes), inputs, device)
+    device, lanes, size = terrain_of_env.device, 1, (len(probes.bundle_body), len(terrain_of_env))
+    while not device.is_cpu and lanes < 16 and 2 * lanes * math.prod(size) <= _MAX_THREADS:
+        lanes *= 2
+    inputs = [poses, terrain_of_env, terrain, probes, ground, parked, lanes, contacts]
+    launch_grid(_collide_strips_kernel, (*size, lanes), inputs, device)
 
 
 def make_contacts(num_envs: int, capacity: int) -> Contacts:

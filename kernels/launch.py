@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-WARP = 32
+_WARP = 32
 BLOCK = 64
 """Threads of a block of a grid: few, so that a small grid reaches all multiprocessors."""
 _BLOCK_FLOATS = 12 * 1024  # 48 KiB: what a block may have without asking
@@ -25,20 +25,6 @@ const unsigned others = ((1u << lanes) - 1u) << (threadIdx.x % 32 / lanes * lane
 for (int k = lanes / 2; k > 0; k /= 2) x = wp::min(x, __shfl_xor_sync(others, x, k));
 #endif
 return x;
-"""
-_VOTE = """
-#if defined(__CUDA_ARCH__)
-return (int)__ballot_sync(0xffffffffu, chosen);
-#else
-return chosen;
-#endif
-"""
-_LOWEST = """
-#if defined(__CUDA_ARCH__)
-return __ffs(bits) - 1;
-#else
-return 0;
-#endif
 """
 _PROLOGUE = Path(__file__).with_name("lanes.cu")
 
@@ -57,18 +43,6 @@ def least_of_lanes(x: int, lanes: int) -> int:
 @wp.func_native(_LEAST)
 def least_float_of_lanes(x: float, lanes: int) -> float:
     """The same of floats."""
-    ...
-
-
-@wp.func_native(_VOTE)
-def vote(chosen: bool) -> int:
-    """Bits of the threads of a warp that are chosen; a CPU's thread is alone. All must call it."""
-    ...
-
-
-@wp.func_native(_LOWEST)
-def lowest_vote(bits: int) -> int:
-    """First of the threads that :func:`vote` chose."""
     ...
 
 
@@ -110,7 +84,7 @@ def make_zeros(struct: Any, device: str | None, **shapes: int | tuple[int, ...])
 
 def fits_block(num_floats: int, lanes: int) -> bool:
     """Whether a block has shared memory for its worlds, of ``lanes`` threads and ``num_floats`` floats each."""
-    return 0 < num_floats * (WARP // lanes) <= _BLOCK_FLOATS
+    return 0 < num_floats * (_WARP // lanes) <= _BLOCK_FLOATS
 
 
 def fill_snippet(body: Path, *, num_floats: int, lanes: int, **values: Any) -> str:
@@ -120,9 +94,9 @@ def fill_snippet(body: Path, *, num_floats: int, lanes: int, **values: Any) -> s
     replace the ``$names`` in the file.
     """
     source = Template(_PROLOGUE.read_text() + body.read_text())
-    return source.substitute(values, num_floats=num_floats, lanes=lanes, worlds=WARP // lanes)
+    return source.substitute(values, num_floats=num_floats, lanes=lanes, worlds=_WARP // lanes)
 
 
 def launch_lanes(kernel: Any, num_worlds: int, inputs: list[Any], *, lanes: int, device: Any) -> None:
     """Launch a kernel of grid (num_worlds * lanes,), with one thread a world on a CPU."""
-    wp.launch(kernel, num_worlds * (1 if device.is_cpu else lanes), inputs=inputs, block_dim=WARP, device=device)
+    wp.launch(kernel, num_worlds * (1 if device.is_cpu else lanes), inputs=inputs, block_dim=_WARP, device=device)
