@@ -7,10 +7,12 @@ what a robot's ``senses`` name: base position, world-local [m], and quaternion w
 each foot geom [N] (x 0.01); joint torques of the last physics step [N m] (J, x 0.01).
 """
 
+from typing import Any
+
 import warp as wp
 
 from kernels.heightfield import Terrain, height_at
-from kernels.launch import kernel_over
+from kernels.launch import kernel_over, launch_grid
 from kernels.state import RobotStep, base_ang_vel_b, base_heading, base_lin_vel_b, projected_gravity
 
 NUM_BASE_COLUMNS = 12
@@ -22,6 +24,7 @@ SCAN_OFFSET = wp.constant(0.5)
 FORCE_SCALE = wp.constant(0.01)
 ACTION_LIMIT = wp.constant(100.0)
 OBSERVATION_LIMIT = wp.constant(100.0)
+_COLUMNS = 4  # that a thread of a GPU writes; a CPU's writes all
 
 
 @wp.struct
@@ -56,8 +59,9 @@ def _base_column(step: RobotStep, env: int, k: int) -> float:
 
 
 @wp.func
-def _scan_column(joint_q: wp.array2d[float], terrain: Terrain, t: int, sensors: Sensors, env: int, k: int) -> float:
-    heading = base_heading(joint_q, env)
+def _scan_column(
+    joint_q: wp.array2d[float], heading: wp.vec2, terrain: Terrain, t: int, sensors: Sensors, env: int, k: int
+) -> float:
     x = joint_q[env, 0] + heading[0] * sensors.scan_x[k] - heading[1] * sensors.scan_y[k]
     y = joint_q[env, 1] + heading[1] * sensors.scan_x[k] + heading[0] * sensors.scan_y[k]
     return wp.clamp(joint_q[env, 2] - SCAN_OFFSET - height_at(terrain, t, x, y), -1.0, 1.0) * SCAN_SCALE
@@ -74,8 +78,8 @@ def _sense_column(step: RobotStep, sensors: Sensors, env: int, k: int) -> float:
     return step.joint_torque[env, sensors.torque_columns[foot - num_feet]] * FORCE_SCALE
 
 
-@kernel_over("observation_out")
-def write_observation(
+@wp.kernel
+def _write_observation_kernel(
     step: RobotStep,
     terrain_of_env: wp.array[int],
     terrain: Terrain,
@@ -83,36 +87,57 @@ def write_observation(
     is_misled: wp.array[int],
     noise: wp.array[float],
     noise_seed: wp.array[int],
+    threads: int,
     observation_out: wp.array2d[float],
 ):
-    """Grid (num_envs, observation_size): write one row an environment (columns: module docstring).
+    """Grid (num_envs, threads)."""
+    env, thread = wp.tid()
+    num_joints = step.action.shape[1]
+    size = observation_out.shape[1]
+    t = terrain_of_env[env]
+    heading = base_heading(step.joint_q, env)
+    for k in range(thread, size, threads):
+        column = float(0.0)
+        joint = k - NUM_BASE_COLUMNS
+        if joint < 0:
+            column = _base_column(step, env, k)
+        elif joint < num_joints:
+            column = step.joint_q[env, 7 + joint] - sensors.default_joint_pos[joint]
+        elif joint < 2 * num_joints:
+            column = step.joint_qd[env, 6 + joint - num_joints] * JOINT_VEL_SCALE
+        elif joint < 3 * num_joints:
+            column = step.action[env, joint - 2 * num_joints]
+        elif joint < 3 * num_joints + sensors.scan_x.shape[0]:
+            if is_misled.shape[0] == 0 or is_misled[env] == 0:
+                column = _scan_column(step.joint_q, heading, terrain, t, sensors, env, joint - 3 * num_joints)
+        else:
+            column = _sense_column(step, sensors, env, joint - 3 * num_joints - sensors.scan_x.shape[0])
+        if k < noise.shape[0]:
+            state = wp.rand_init(noise_seed[0], env * size + k)
+            column += noise[k] * wp.randf(state, -1.0, 1.0)
+        observation_out[env, k] = wp.clamp(column, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
+def write_observation(
+    step: RobotStep,
+    terrain_of_env: Any,
+    terrain: Terrain,
+    sensors: Sensors,
+    is_misled: Any,
+    noise: Any,
+    noise_seed: Any,
+    observation_out: Any,
+) -> None:
+    """Write one row an environment, (num_envs, observation_size) (columns: module docstring).
 
     The command is in the base's yaw frame; where ``is_misled``, (num_envs,) or None, the scan is 0, for a condition to
     add what a wrong map shows; ``noise`` are half widths of uniform noise, (observation_size,), or None; ``noise_seed``
     is one integer that the caller advances, shape (1,).
     """
-    env, k = wp.tid()
-    num_joints = step.action.shape[1]
-    column = float(0.0)
-    joint = k - NUM_BASE_COLUMNS
-    if joint < 0:
-        column = _base_column(step, env, k)
-    elif joint < num_joints:
-        column = step.joint_q[env, 7 + joint] - sensors.default_joint_pos[joint]
-    elif joint < 2 * num_joints:
-        column = step.joint_qd[env, 6 + joint - num_joints] * JOINT_VEL_SCALE
-    elif joint < 3 * num_joints:
-        column = step.action[env, joint - 2 * num_joints]
-    elif joint < 3 * num_joints + sensors.scan_x.shape[0]:
-        if is_misled.shape[0] == 0 or is_misled[env] == 0:
-            t = terrain_of_env[env]
-            column = _scan_column(step.joint_q, terrain, t, sensors, env, joint - 3 * num_joints)
-    else:
-        column = _sense_column(step, sensors, env, joint - 3 * num_joints - sensors.scan_x.shape[0])
-    if k < noise.shape[0]:
-        state = wp.rand_init(noise_seed[0], env * observation_out.shape[1] + k)
-        column += noise[k] * wp.randf(state, -1.0, 1.0)
-    observation_out[env, k] = wp.clamp(column, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    device, (num_envs, size) = observation_out.device, observation_out.shape
+    threads = 1 if device.is_cpu else -(-size // _COLUMNS)
+    inputs = [step, terrain_of_env, terrain, sensors, is_misled, noise, noise_seed, threads, observation_out]
+    launch_grid(_write_observation_kernel, (num_envs, threads), inputs, device)
 
 
 @kernel_over("action")

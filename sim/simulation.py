@@ -41,10 +41,11 @@ from sim.terrains.conditions.perception import MAX_MAP_DELAY_S
 _SET_UP = ("newton._src.solvers.mujoco.kernels", "newton._src.geometry.bvh", "mujoco_warp._src.set_const")
 """Modules with many kernels that run when a simulation is built, and never again."""
 _NEEDED_LAST = (
+    "mujoco_warp._src.smooth",
     *(f"kernels.{name}" for name in ("heightfield", "super_gaussian", "queue", "contact", "coordinates", "episode")),
-    *("kernels.observation", "mujoco_warp._src.smooth"),
+    "kernels.observation",
 )
-"""Modules of kernels in the opposite order of that in which a simulation takes them."""
+"""Modules of kernels that a simulation takes late: first the slowest, then in the opposite order."""
 
 if not wp.is_cuda_available():
     for _name in _SET_UP:  # the same numbers, in a third of the time
@@ -126,6 +127,7 @@ class Simulation:
         weight = {"mujoco:geom_solmix": 0.0}
         scene.add_shape_plane(plane=(0.0, 0.0, 1.0, 0.0), width=0.0, length=0.0, custom_attributes=weight)
         scene.add_world(builder)  # Newton and mujoco_warp set one robot up; all worlds share its numbers
+        scene.validate_inertia_detailed = True  # the same for one robot in Python, without a kernel to compile
         self.model = scene.finalize()
 
     def _build_solver(self, cfg: SolverCfg, file_model: Any) -> None:
