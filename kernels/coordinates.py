@@ -64,6 +64,7 @@ def _to_solver_kernel(
     joint_q: wp.array2d[float],
     joint_qd: wp.array2d[float],
     targets: wp.array2d[float],
+    has_state: bool,
     delay_out: Delay,
     solver_out: SolverState,
 ):
@@ -71,7 +72,7 @@ def _to_solver_kernel(
     env, thread = wp.tid()
     k = thread - 1
     if k >= 0:
-        if k < solver_out.column_of_joint.shape[0]:
+        if not has_state and k < solver_out.column_of_joint.shape[0]:
             column = solver_out.column_of_joint[k]
             solver_out.qpos[env, column] = joint_q[env, 7 + k]
             solver_out.qvel[env, column - 1] = joint_qd[env, 6 + k]
@@ -82,6 +83,8 @@ def _to_solver_kernel(
                 if delay_out.steps.shape[0] > 0:
                     target = _due_target(target, delay_out.at_first[column - 7], env, k, delay_out)
                 solver_out.ctrl[env, k] = target
+        return
+    if has_state:
         return
     com_velocity = wp.vec3(joint_qd[env, 0], joint_qd[env, 1], joint_qd[env, 2])
     rate = wp.vec3(joint_qd[env, 3], joint_qd[env, 4], joint_qd[env, 5])
@@ -95,10 +98,12 @@ def _to_solver_kernel(
     solver_out.qpos[env, 3] = joint_q[env, 6]
 
 
-def to_solver(joint_q: Any, joint_qd: Any, targets: Any, delay_out: Delay, solver_out: SolverState) -> None:
-    """Write coordinates, velocities and the targets in effect to mujoco_warp's data."""
+def to_solver(
+    joint_q: Any, joint_qd: Any, targets: Any, delay_out: Delay, solver_out: SolverState, *, has_state: bool = False
+) -> None:
+    """Write coordinates and velocities, unless it ``has_state``, and the targets in effect to mujoco_warp's data."""
     threads = 1 + max(len(solver_out.column_of_joint), len(solver_out.target_of_actuator))
-    inputs = [joint_q, joint_qd, targets, delay_out, solver_out]
+    inputs = [joint_q, joint_qd, targets, has_state, delay_out, solver_out]
     launch_grid(_to_solver_kernel, (len(joint_q), threads), inputs, joint_q.device)
 
 

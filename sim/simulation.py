@@ -367,7 +367,8 @@ class Simulation:
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
             if not follows or self._delay.age is not None or self._net is not None:  # which change the controls
-                to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates)
+                state = self.joint_q, self.joint_qd, self.targets
+                to_solver(*state, self._delay, coordinates, has_state=follows)
             if self.disturbed is not None and self.robot.arm_joints:
                 make_robot_stage(condition_effects("drive"), ForcedStep)(self._forced)
             if self._net is not None:
