@@ -240,6 +240,7 @@ def test_the_order_in_which_contacts_were_found_changes_no_bit(device):
             np.testing.assert_array_equal(array, first)
 
 
+@pytest.mark.slow  # mujoco_warp compiles half a hundred kernels for it
 def test_robots_that_fall(eight, monkeypatch):
     """Steps of the robots that searches cross with, in all states of their contacts, against mujoco_warp's.
 
