@@ -15,7 +15,7 @@ from kernels.ground import FIRM, Ground, patch_at
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
 from kernels.launch import kernel_over, launch_grid, least_float_of_lanes, least_of_lanes, make_zeros
 
-_MAX_THREADS = 150_000  # of a GPU: while there are no more, several threads share the probes of a strip
+_MAX_THREADS = 150_000  # that a GPU is given: where robots are few, several share the probes of a strip
 _NONE = wp.constant(2**30)
 vec5 = wp.types.vector(5, float)
 """MuJoCo's frictions of a contact, or an impedance."""

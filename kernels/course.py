@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from kernels.launch import kernel_over
+from kernels.launch import kernel_over, launch_grid
 
 SPACING = 0.05
 """Distance of neighbouring nodes [m], for which courses are made."""
@@ -255,7 +255,7 @@ def lay_elements(elements: Any, all_kinds: Kinds, first_col: int = 0) -> None:
     Of :class:`Element`, shape (num_terrains, num_elements), they have kind, first, size, length, detail and turn. One
     that does not fit before x = 12 m is cut, or becomes flat.
     """
-    wp.launch(_make_kernels(all_kinds)[0], len(elements), [first_col, elements], device=elements.device)
+    launch_grid(_make_kernels(all_kinds)[0], (len(elements),), [first_col, elements], elements.device)
 
 
 def rasterise_elements(elements: Any, all_kinds: Kinds, heights_out: Any, factor: float = 1.0) -> None:

@@ -16,8 +16,7 @@ from typing import Any
 import warp as wp
 
 _WARP = 32
-BLOCK = 64
-"""Threads of a block of a grid: few, so that a small grid reaches all multiprocessors."""
+_BLOCK = 64  # threads of a block of a grid: few, so that a small grid reaches all multiprocessors
 _BLOCK_FLOATS = 12 * 1024  # 48 KiB: what a block may have without asking
 _LEAST = """
 #if defined(__CUDA_ARCH__)
@@ -29,9 +28,9 @@ return x;
 _PROLOGUE = Path(__file__).with_name("lanes.cu")
 
 
-def launch_grid(kernel: Any, size: int | tuple[int, ...], inputs: Sequence[Any], device: Any) -> None:
-    """Launch a kernel of so many threads in blocks of :data:`BLOCK`."""
-    wp.launch(kernel, size, inputs=inputs, device=device, block_dim=BLOCK)
+def launch_grid(kernel: Any, size: tuple[int, ...], inputs: Sequence[Any], device: Any) -> None:
+    """Launch a kernel of so many threads; all kernels of a module by this function, or it is compiled twice."""
+    wp.launch(kernel, size, inputs=inputs, device=device, block_dim=_BLOCK)
 
 
 @wp.func_native(_LEAST)

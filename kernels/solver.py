@@ -67,7 +67,7 @@ class Problem:
     surfaces: Surfaces
     contacts: Contacts
     spilled_contacts: wp.array2d[float]
-    """Contacts that do not fit into shared memory, shape (num_worlds, :meth:`Sizes.global_floats`)."""
+    """Contacts that do not fit into shared memory, shape (num_worlds, :attr:`Sizes.global_floats`)."""
     qacc_warmstart: wp.array2d[float]
     solver_niter: wp.array[int]
     overflow: wp.array[int]
@@ -85,6 +85,8 @@ class Sizes:
     """Stored entries of the inertia."""
     losses: bool
     """Whether there is friction in any joint."""
+    capacity: int
+    """Contacts that a robot has room for."""
 
     @property
     def dofs(self) -> int:
@@ -160,14 +162,16 @@ class Sizes:
         """Floats of shared memory that a robot needs."""
         return self._matrix_floats + self.shared_contacts * self._floats_per_contact
 
-    def global_floats(self, capacity: int) -> int:
-        """Floats of global memory that a robot needs, with room for ``capacity`` contacts; at least 1."""
-        return max(1, (capacity - self.shared_contacts) * self._floats_per_contact)
+    @property
+    def global_floats(self) -> int:
+        """Floats of global memory that a robot needs, at least 1."""
+        return max(1, (self.capacity - self.shared_contacts) * self._floats_per_contact)
 
 
 @cache
-def _kernel(sizes: Sizes, spills: bool, codes: tuple[tuple[str, Any], ...]) -> Any:
-    values = asdict(sizes) | dict(codes) | {"losses": str(sizes.losses).lower(), "spills": str(spills).lower()}
+def _kernel(sizes: Sizes, codes: tuple[tuple[str, Any], ...]) -> Any:
+    conditions = {"losses": sizes.losses, "spills": sizes.capacity > sizes.shared_contacts}
+    values = asdict(sizes) | dict(codes) | {name: str(holds).lower() for name, holds in conditions.items()}
     values |= {"chunk": _CHUNK, "num_shared": sizes.shared_contacts, "stride": sizes.stride, "dofs": sizes.dofs}
     values |= {"part_rows": sizes.part_rows} | sizes.describe_elimination()
     snippet = fill_snippet(_BODY, num_floats=sizes.shared_floats, lanes=LANES, **values)
@@ -193,6 +197,5 @@ def step_robots(robots: Robots, problem: Problem, sizes: Sizes, codes: dict[str,
     ``codes`` are MuJoCo's numbers, by their names in solver.cu: the type of a free joint, overflow bits, limits of
     impedances, the smallest divisor.
     """
-    spills = problem.contacts.shape.shape[1] > sizes.shared_contacts
-    kernel = _kernel(sizes, spills, tuple(codes.items()))
+    kernel = _kernel(sizes, tuple(codes.items()))
     launch_lanes(kernel, len(robots.qvel), [robots, problem], lanes=LANES, device=robots.qvel.device)

@@ -19,7 +19,7 @@ from kernels.contact import Poses, collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, to_solver
 from kernels.episode import Episodes, Outcome
 from kernels.ground import Ground
-from kernels.launch import BLOCK, make_struct, make_zeros
+from kernels.launch import make_struct, make_zeros
 from kernels.observation import Sensors, write_observation
 from kernels.penalties import BASE, FOOT, LIMB
 from kernels.queue import StartRanges, clear_rows, restart_episodes
@@ -55,7 +55,7 @@ if not wp.is_cuda_available():
 def load_kernels(device: str) -> None:
     """Load the kernels that a simulation takes last, while another process compiles those that it takes first."""
     for name in _NEEDED_LAST:
-        wp.load_module(name, device=device, block_dim=BLOCK)
+        wp.load_module(name, device=device)
 
 
 class Simulation:
@@ -360,15 +360,15 @@ class Simulation:
     def physics_step(self, *, follows: bool = False) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.
 
-        If it ``follows`` another at once, nothing has changed the state between, which the solver still has.
+        One that ``follows`` another at once takes state and targets as the solver has them: neither may have changed.
         It leaves out what these robots do not need: forces from outside (``body_f``, ``joint_f``) but those of
         conditions, targets of velocities, and poses of bodies after the step, which the next one finds again.
         """
         solver, coordinates = self.solver, self._coordinates
         with wp.ScopedDevice(self.device), solver._scoped_mujoco_warp_execution():
-            if not follows or self._delay.age is not None or self._net is not None:  # which change the controls
-                state = self.joint_q, self.joint_qd, self.targets
-                to_solver(*state, self._delay, coordinates, has_state=follows)
+            if not follows or any(x is not None for x in (self._delay.age, self._net, self.disturbed)):
+                # Controls at least: delays, networks and conditions of arms change them.
+                to_solver(self.joint_q, self.joint_qd, self.targets, self._delay, coordinates, has_state=follows)
             if self.disturbed is not None and self.robot.arm_joints:
                 make_robot_stage(condition_effects("drive"), ForcedStep)(self._forced)
             if self._net is not None:

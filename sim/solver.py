@@ -168,7 +168,7 @@ class Dynamics:
                 dof_actuator=wp.array(actuator, dtype=int),
                 roots=wp.array(np.unique(m.body_rootid.numpy()[1:]).astype(np.int32), dtype=int),
             )
-            spilled = wp.zeros((d.nworld, sizes.global_floats(contacts.shape.shape[1])), dtype=float)
+            spilled = wp.zeros((d.nworld, sizes.global_floats), dtype=float)
             slope = wp.zeros((d.nworld, m.nv), dtype=float)
         ours = {"contacts": contacts, "surfaces": surfaces, "spilled_contacts": spilled}
         self._problem = make_struct(Problem, model, m.opt, d, **ours)
@@ -263,6 +263,7 @@ def make_dynamics(
         dimensions=max(3, int(m.nmaxcondim)),
         inertia=entries,
         losses=bool((m.dof_frictionloss.numpy() > 0.0).any()),
+        capacity=contacts.shape.shape[1],
     )
     fits = fits_block(tree.shared_floats, dynamics.LANES) and fits_block(sizes.shared_floats, solver.LANES)
     if fits and is_supported(m):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+import kernels.contact
 from kernels.contact import Contacts, Poses, Probes, collide_strips, make_contacts, sum_forces
 from kernels.ground import FIRM, PATCHES, Ground, make_ground
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
@@ -95,6 +96,21 @@ def test_a_row_that_sags_is_looked_at_where_it_touches():
     assert records["count"].tolist() == [1]
     np.testing.assert_allclose(records["centre"][0], sagging[1], atol=1e-6)
     assert not collide(poses, [0], flat, [(np.array(sagging), 0.05)])["count"].any()
+
+
+def test_how_many_threads_share_a_strip_changes_no_bit(device, monkeypatch):
+    if device == "cpu":
+        pytest.skip("a CPU has one thread for each")
+    poses, row = sphere_poses(np.random.default_rng(8), BOXES, 100)[:, :1], np.linspace([0, 0, -0.2], [0, 0, 0.2], 9)
+    found = []
+    for most in (kernels.contact._MAX_THREADS, 0):  # 16 threads, and one
+        monkeypatch.setattr(kernels.contact, "_MAX_THREADS", most)
+        records = collide(poses, np.zeros(100, int), BOXES[None], [(row, 0.04)])
+        order = np.lexsort((records["rank"], records["env"]))
+        found.append({name: records[name][order] for name in ("env", "rank", "point", "normal", "distance")})
+    assert len(found[0]["env"]) > 40
+    for name, values in found[0].items():
+        np.testing.assert_array_equal(values, found[1][name], err_msg=name)
 
 
 def test_strips_report_first_deepest_and_last():
