@@ -38,7 +38,10 @@ from sim.terrains.bank import TerrainBank
 from sim.terrains.conditions.kinds import MAX_LATENCY_S, condition_effects
 from sim.terrains.conditions.perception import MAX_MAP_DELAY_S
 
-_SET_UP = ("newton._src.solvers.mujoco.kernels", "newton._src.geometry.bvh", "mujoco_warp._src.set_const")
+_SET_UP = (
+    *("newton._src.solvers.mujoco.kernels", "newton._src.geometry.bvh", "newton._src.sim.articulation"),
+    "mujoco_warp._src.set_const",
+)
 """Modules with many kernels that run when a simulation is built, and never again."""
 _NEEDED_LAST = (
     "mujoco_warp._src.smooth",

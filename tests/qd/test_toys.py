@@ -17,6 +17,7 @@ from sim.terrains.spaces.registry import get_space
 from tests.qd.searches import crossing_by
 from tests.sim.dogs import write_dog
 
+pytestmark = pytest.mark.slow
 SIZE = ["--scheduler.emitters", "1", "--scheduler.batch-size", "4", "--replicas", "2", "--iterations", "2"]
 
 

@@ -20,6 +20,8 @@ from sim.recording.recorder import read_recording
 from tests.builders import free_port
 from tests.qd.show.view.browser import visit
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def show(anymal, published):
