@@ -25,7 +25,7 @@ from sim.device import resolve_device
 from sim.recording.renderer import open_context
 from sim.robots.find import get_robot
 from sim.robots.robot import ROBOTS
-from sim.simulation import Simulation, load_kernels
+from sim.simulation import Simulation
 from sim.terrains.bank import TerrainBank
 
 DEVICE = os.environ.get("FAULTLINE_DEVICE", "cpu")
@@ -57,13 +57,6 @@ def forked_workers():
         if DEVICE == "cpu":
             patch.setattr(process, "CONTEXT", fork_from(*WORKERS))
         yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def other_half(request):
-    """Of two processes without compiled kernels the second begins with those that the first takes last."""
-    if DEVICE == "cpu" and getattr(request.config, "workerinput", {}).get("workerid") == "gw1":
-        load_kernels("cpu")
 
 
 @pytest.fixture(scope="module")
