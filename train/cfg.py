@@ -24,8 +24,8 @@ from sim.terrains.hand_crafted import NUM_LEVELS
 
 _BASE_ON_CPU = {"num_envs": 32, "iterations": 20}
 _TUNING_ON_CPU = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain
-LARGE = {"num_envs": 8192, "terrains": 2000}
-"""Sizes that left ANYmal a third of the faults that the paper's left."""
+LARGE = {"num_envs": 8192, "terrains": 2000, "iterations": 1200}
+"""Sizes of each training of a hardening on a GPU: robots, terrains at a time and steps are several times the paper's."""
 SPECIALIST = {**LARGE, "iterations": 1000}
 """Sizes of the training of a search's own specialist."""
 _SPECIALIST_SEED = 7
@@ -297,8 +297,8 @@ class HardenCfg:
     """Train a specialist for each search too, whose certificates count beside those of the panel."""
     search: RoundSearchCfg = field(default_factory=RoundSearchCfg)
     tune: FinetuneCfg = field(default_factory=FinetuneCfg)
-    """Each training, but for controller, seed, archives and space, which are the round's. On CUDA it has 8192 robots
-    and 2000 terrains at a time (Cassie: the paper's sizes)."""
+    """Each training, but for controller, seed, archives and space, which are the round's. On CUDA it has 8192 robots,
+    2000 terrains at a time and 1200 iterations."""
     evaluation: RoundEvaluationCfg = field(default_factory=RoundEvaluationCfg)
 
     @classmethod
@@ -308,4 +308,4 @@ class HardenCfg:
 
     def sized_tune(self, robot: RobotCfg, device: str) -> FinetuneCfg:
         """The settings of each training, with sizes of 0 replaced by those that suit the robot and the Warp device."""
-        return self.tune.sized(robot, device, **(LARGE if robot.tuning.large_rounds else {}))
+        return self.tune.sized(robot, device, **LARGE)

@@ -28,7 +28,7 @@ from train.finetune import finetune
 from train.ppo.checkpoint import CHECKPOINT
 
 MIXES = {"C-HC": "hand-crafted", "C-HR": "hard-random", "C-G": "generated"}
-SIZES: dict[str, dict[str, int]] = {"tables": {**LARGE, "iterations": 1200}, "tables_paper_sizes": {}}
+SIZES: dict[str, dict[str, int]] = {"tables": LARGE, "tables_paper_sizes": {}}
 """Robots, terrains at a time and iterations by the file that they are of; the paper's are the default."""
 TRAININGS = {f"tables: {name}-{seed}": ("tables", name, seed) for name in MIXES for seed in SEEDS}
 TRAININGS |= {f"tables_paper_sizes: {name}": ("tables_paper_sizes", name, SEEDS[0]) for name in MIXES}

@@ -102,8 +102,6 @@ class TuningCfg:
     entropy: NonNegativeFloat = 0.005
     """Weight of the entropy bonus. It widens the noise of the actions, which a further training begins with."""
     average: Share = 0.2  # Share of all iterations, the last ones, whose actors are averaged into the controller.
-    large_rounds: bool = True
-    """Whether a hardening on a GPU trains with 8192 robots and 2000 terrains at a time, else with the paper's."""
 
 
 @dataclass(frozen=True, kw_only=True)
