@@ -25,7 +25,7 @@ from sim.terrains.hand_crafted import NUM_LEVELS
 _BASE_ON_CPU = {"num_envs": 32, "iterations": 20}
 _TUNING_ON_CPU = {"num_envs": 24, "terrains": 12, "swap_every": 50, "iterations": 100}  # 24 s a terrain
 LARGE = {"num_envs": 8192, "terrains": 2000, "iterations": 1200}
-"""Sizes of each training of a hardening on a GPU: robots, terrains at a time and steps are several times the paper's."""
+"""Sizes of each training of a hardening on a GPU, several times the paper's: robots, terrains at a time and steps."""
 SPECIALIST = {**LARGE, "iterations": 1000}
 """Sizes of the training of a search's own specialist."""
 _SPECIALIST_SEED = 7

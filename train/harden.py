@@ -19,6 +19,7 @@ from qd.evaluate.tables import show_table, terrain_rates
 from qd.faults.judge import judge
 from qd.faults.numbers import EPISODES
 from qd.search.archive import read_archive
+from qd.search.crossed import usual_crossed
 from qd.search.directory import ROUNDS_FILE, RunDirectory, claimed, read_robot_archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, differences, preset
@@ -200,7 +201,9 @@ class _Hardening:
         cfg = preset(named, self.robot, policy, space=self.space.name, space_sha256=self.space.sha256)
         usual = _GPU_EPISODES if on_cuda else cfg.iterations * cfg.episodes_per_iteration
         iterations = -(-(size.episodes or usual) // cfg.episodes_per_iteration)
-        return replace(cfg, seed=self._seed(number), iterations=iterations)
+        crossed = usual_crossed(cfg.scheduler, self.robot, self.space)
+        fitness = replace(cfg.fitness, crossed=crossed)
+        return replace(cfg, seed=self._seed(number), iterations=iterations, fitness=fitness)
 
     def evaluate(self) -> None:
         """Evaluates all controllers so far, and writes ``rounds.json`` where these rounds are not all in it."""

@@ -21,6 +21,7 @@ from scipy.special import stdtrit
 
 from qd.faults.judge import judge
 from qd.search.archive import Archive
+from qd.search.crossed import usual_crossed
 from qd.search.directory import RunDirectory, read_robot_archive
 from qd.search.loop import search
 from qd.search.settings import SearchCfg, preset
@@ -91,12 +92,20 @@ class Script:
         """Folder of the robot's unpublished runs."""
         return self.out.parent / "runs" if self.small else runs_of_today() / self.robot.name
 
-    def search_cfg(self, iterations: int | None = None, *, episodes: int | None = None, **changes: Any) -> SearchCfg:
+    def search_cfg(
+        self,
+        iterations: int | None = None,
+        *,
+        episodes: int | None = None,
+        crossed: float | None = None,
+        **changes: Any,
+    ) -> SearchCfg:
         """Settings of a search of preset wide; a trial has four terrains, too few to train a specialist on.
 
         Args:
             iterations: Iterations; without them ``episodes`` or the preset decide.
             episodes: Episodes, rounded to whole iterations.
+            crossed: How much less what nobody crosses is worth; as the command has it if None.
             changes: Values of settings or of the scheduler's settings by name, and ``policy`` and ``space``.
         """
         searched = {name: changes.pop(name) for name in ("policy", "space") if name in changes}
@@ -107,13 +116,19 @@ class Script:
             scheduler |= {"emitters": 2, "batch_size": 2, "groups": 1}
             changes["replicas"] = 1
         cfg = replace(cfg, scheduler=replace(cfg.scheduler, **scheduler), **changes)
+        if crossed is None:
+            crossed = usual_crossed(cfg.scheduler, self.robot, cfg.terrain_space)
+        cfg = replace(cfg, fitness=replace(cfg.fitness, crossed=crossed))
         if episodes is not None:
             (iterations,) = self.count_iterations(cfg, episodes)
         return replace(cfg, iterations=iterations or cfg.iterations)
 
     def count_iterations(self, cfg: SearchCfg, *episodes: int) -> list[int]:
-        """Whole iterations of a search nearest to each number of episodes; one in a trial."""
-        return [1] if self.small else [round(count / cfg.episodes_per_iteration) for count in episodes]
+        """Whole iterations of a search nearest to each number of episodes, labels included; one in a trial."""
+        if self.small:
+            return [1]
+        label = cfg.fitness.crossed > 0.0  # labels take an iteration's episodes
+        return [round(count / cfg.episodes_per_iteration) - label for count in episodes]
 
     def publish(self, run: Path, folder: Path, patterns: Sequence[str]) -> None:
         """Copies files of a run into a published folder; files of another archive that the run lacks are removed."""

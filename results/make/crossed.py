@@ -6,7 +6,6 @@ episodes. The searches of seed 20 choose the weight; those of other seeds, with 
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +33,9 @@ def run_of(script: Script, weight: float, seed: int) -> Path:
 
 def follow(script: Script, weight: float, seed: int) -> dict[str, Any]:
     """Counts of a search with their origin, searched and judged where today's sources have not."""
-    cfg = script.search_cfg(seed=seed, **({"again": 2} if script.small else {}))
-    (iterations,) = script.count_iterations(cfg, EPISODES)
-    cfg = replace(cfg, fitness=replace(cfg.fitness, crossed=weight))
+    cfg = script.search_cfg(seed=seed, crossed=weight, **({"again": 2} if script.small else {}))
     run = run_of(script, weight, seed)
-    (counts,) = follow_search(script, run, cfg, [max(1, iterations - (weight > 0.0))], COUNTS, STAGES)
+    (counts,) = follow_search(script, run, cfg, script.count_iterations(cfg, EPISODES), COUNTS, STAGES)
     failing, certified = counts["failing"], counts["certified"]
     share = 1.0 - certified / failing if failing and certified is not None else None
     return {"weight": weight, "search_seed": seed, **origin_of(script, run), **counts, SHARE: share}

@@ -46,7 +46,7 @@ def row_of(script: Script, name: str) -> dict[str, Any]:
     """The row of one search."""
     design_name, seed, episodes = SEARCHES[name]
     design = {} if script.small else DESIGNS[design_name]
-    cfg = script.search_cfg(episodes=episodes, seed=seed, **design)
+    cfg = script.search_cfg(episodes=episodes, seed=seed, crossed=0.0, **design)
     run = script.runs / "search_noise" / file_name(name)
     search(cfg, run, script.compute)
     archive = judge(run, stages=("fresh",), compute=script.compute)
