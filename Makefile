@@ -1,7 +1,7 @@
 # The doors of the project. Every target works in .venv, built from pyproject.toml and constraints.txt: `make setup` installs all
 # packages, a target that only searches, shows or tests installs those that this takes.
 .DEFAULT_GOAL := help
-.PHONY: help setup archive train finetune harden evaluate report view bench docs pictures test test-all test-gpu lint
+.PHONY: help setup archive train finetune harden evaluate report view bench docs pictures release-check test test-all test-gpu lint
 
 PYTHON ?= python3
 ROBOT ?=
@@ -103,6 +103,9 @@ docs: setup ## Write the tables of README and docs/ anew from the results
 
 pictures: setup ## Make the pictures of README and docs/ anew: some minutes, a browser
 	$(BIN)/python -m results.make.pictures
+
+release-check: setup ## Name the published files that are not of this checkout's sources
+	$(BIN)/python -m results.make.common
 
 test: $(TEST) ## Run the quick tests: some minutes on two cores
 	$(PYTEST) $(ON_TWO_CORES) -m 'not slow and not ray' $(ARGS)

@@ -27,7 +27,7 @@ from tests.sim.dogs import urdf
 def test_pages_are_short_and_readme_leads_to_each():
     assert len(text_of("README.md").splitlines()) <= 130
     written = [re.sub("<!-- table:.*?<!-- end -->", "", text_of(page), flags=re.S) for page in PAGES]
-    assert len(PAGES) <= 1 + 13 and sum(len(text.encode()) for text in written) <= 119_900  # tables are made
+    assert len(PAGES) <= 1 + 18 and sum(len(text.encode()) for text in written) <= 130_000  # tables are made
     assert set(re.findall(r"\]\((docs/[\w-]+\.md)", text_of("README.md"))) == set(PAGES) - {"README.md"}
     pictures = {Path(name).name for page in PAGES for name in re.findall(r"pictures/([\w.-]+)", text_of(page))}
     files = [*(ROOT / "docs/pictures").iterdir()]

@@ -1,6 +1,7 @@
 """Flags of the scripts, the file that each writes, and means over seeds with their intervals.
 
-As a command, ``python -m results.make.common FILE`` exits with 0 if today's sources made the file.
+As a command, ``python -m results.make.common FILE ...`` exits with 0 if today's sources made the files, all that are
+published if none is named (``make release-check``).
 """
 
 import argparse
@@ -345,5 +346,15 @@ def is_current(file: Path) -> bool:
     return content.get("sources_sha256") == sources_sha256() and not (content.get("small") or content.get("lacks"))
 
 
+def find_older(files: Sequence[Path]) -> list[Path]:
+    """Published files that other sources made, of all where none is named; prints the commit of each."""
+    named = files or [file for file in sorted(Path("results").rglob("*.json")) if "sources_sha256" in read_made(file)]
+    older = [file for file in named if not is_current(file)]
+    for file in older:
+        commit = str(read_made(file).get("commit") or "no commit")[:8]
+        print(f"{file} is of {commit}, and not of today's sources: make it anew by results/make/all.sh")
+    return older
+
+
 if __name__ == "__main__":
-    sys.exit(not is_current(Path(sys.argv[1])))
+    sys.exit(bool(find_older([*map(Path, sys.argv[1:])])))

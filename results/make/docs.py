@@ -102,12 +102,40 @@ def rate_table(rows: Mapping[str, tuple[str, str, str]], *, short: bool = False)
     return table(rows, {name: partial(rate, controller=name, short=short) for name in CONTROLLERS})
 
 
-def archives(kind: str = "") -> str:
-    """Counts of the published searches, beside the paper's; fewer of the ``short`` kind."""
-    rows, paper = {}, read(PAPER)
+def searches() -> dict[str, dict[str, Any]]:
+    """Counts of the published archives, by the default method and by the paper's, of each robot."""
+    rows = {}
     for (robot, label), name in product(ROBOTS.items(), ("archive", "archive_cma_mae")):
-        rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = read(f"results/{robot}/{name}/archive.json")
-    rows |= {f"{label}, the paper": {"episodes": 4e6, **paper[robot]["archive"]} for robot, label in ROBOTS.items()}
+        if numbers := read(f"results/{robot}/{name}/archive.json"):
+            rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = numbers
+    return rows
+
+
+def first() -> str:
+    """What a search finds, in a few rows, with the paper's elites."""
+    paper = read(PAPER)
+
+    def in_minutes(elites: int, minutes: float | None) -> str:
+        return f"{elites:,}" if minutes is None else f"{elites:,} in {minutes:,.0f} minutes"
+
+    def of_paper(row: Any) -> str:
+        archive = paper[row["robot"]]["archive"]
+        return in_minutes(archive["elites"], 60 * archive["hours"] if "hours" in archive else None)
+
+    columns: dict[str, Column] = {
+        "elites of 4 million episodes, each the hardest of its kind": lambda row: in_minutes(
+            row["elites"], row["wall_s"] / 60
+        ),
+        "... in the paper": of_paper,
+        "distinct ones that it fails in fresh episodes": "failing_distinct",
+        "distinct *faults*: it fails, and another controller crosses": "faults_distinct",
+    }
+    rows = {label: row for label, row in searches().items() if label in ROBOTS.values()}
+    return table(rows, columns, upright=True)
+
+
+def archives() -> str:
+    """Counts of the published searches."""
 
     def holding(row: Mapping[str, Any]) -> str:
         crossed = row.get("faults_mujoco_c")
@@ -135,10 +163,25 @@ def archives(kind: str = "") -> str:
         "families of all faults": "fault_families",
         "*distinct* faults": "faults_distinct",
     }
-    if kind == "short":
-        several = ("families", "failing_families", "elites_same_cell", "confirmed", "faults_fdr", "strong", "robust")
-        columns = {name: column for name, column in columns.items() if column not in several}
-    return table({name: numbers for name, numbers in rows.items() if numbers}, columns, upright=True)
+    return table(searches(), columns, upright=True)
+
+
+def paper_archives() -> str:
+    """The paper's archives, and those of its method here."""
+    rows = {}
+    for robot, label in ROBOTS.items():
+        numbers = read(f"results/{robot}/archive_cma_mae/archive.json")
+        rows[f"{label}, here"] = {**numbers, "hours": numbers["wall_s"] / 3600}
+        rows[f"{label}, the paper"] = read(PAPER)[robot]["archive"]
+    columns: dict[str, Column] = {
+        "elites": "elites",
+        "... with a base collision": "with_collision",
+        "... without": "without_collision",
+        "mean fitness": shown("mean_fitness", form=".1f"),
+        "QD score": "qd_score",
+        "hours": shown("hours", form=".1f"),
+    }
+    return table(rows, columns, upright=True)
 
 
 def witnesses() -> str:
@@ -648,10 +691,10 @@ def kernels() -> str:
 TABLES: dict[str, Callable[..., str]] = {
     make.__name__: make
     for make in (
-        *(archives, training, goals, beside_paper, methods, hardening, searched_again, spaces, sizes, agreement),
-        *(minimal, packs, league, films, drives, speed, kernels, conditions, condition_examples, differences),
-        *(witnesses, witness_curve, crossed, crossed_weights, left),
-        *(condition_searches, map_training, league_routes),
+        *(first, archives, paper_archives, beside_paper, training, goals, differences, methods, hardening),
+        *(searched_again, spaces, sizes, agreement, minimal, packs, league, league_routes, films, drives, speed),
+        *(kernels, conditions, condition_examples, condition_searches, map_training, witnesses, witness_curve),
+        *(crossed, crossed_weights, left),
     )
 }
 

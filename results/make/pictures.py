@@ -6,22 +6,28 @@ conditions, and ``stills`` shows the worst course where its search is here (resu
 ``pages`` takes the pictures of the viewer and of the report. ``curves`` draws what the published files say of searches.
 """
 
+import itertools
 import subprocess
 import sys
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
+from kernels.course import GENES_PER_ELEMENT, SPACING
 from kernels.episode import Outcome
 from qd.faults.families import KIN_M
 from qd.faults.searches import controllers_in
+from qd.search.archive import read_archive
 from qd.show.crossed import find_typical_episode, make_title
 from qd.show.elites import open_run
-from qd.show.figures import save_figure
+from qd.show.figures import draw_archive, save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
 from qd.show.replay import ReplaySource, save, source_from_map, source_from_run
 from results.make.common import runs_of_today
@@ -30,7 +36,10 @@ from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
 from sim.rates import typical_outcome
 from sim.robots.find import get_robot
+from sim.terrains.bank import make_heights
 from sim.terrains.conditions.kinds import CONDITIONS
+from sim.terrains.elements.kinds import ELEMENTS
+from sim.terrains.spaces.course import Course
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 STILL_SIZE = (640, 360)
@@ -158,9 +167,63 @@ def draw_left() -> Figure:
     return figure
 
 
+def draw_elements() -> Figure:
+    """Every element of a course but flat ground, each alone, and as hard as it is there."""
+    course = Course()
+    kinds = [ELEMENTS[name] for name in course.kinds]
+    genes = np.full((len(kinds), 6, GENES_PER_ELEMENT), -1.0, np.float32)  # flat ground of no length is what is left
+    ends = {"low": -1.0, "high": 1.0, "either": 1.0}
+    for number, kind in enumerate(kinds):
+        genes[number, 0, :2] = (2 * number + 1) / len(kinds) - 1.0, -0.9  # kind, and a little flat ground before it
+        genes[number, 0, 2:] = [ends.get(limits.hard, 0.0) for limits in kind.ranges]
+    genes = genes[1:].reshape(len(kinds) - 1, -1)
+    heights = make_heights(genes, course)
+    figure = new_figure(12, 7.2)
+    y, x = (SPACING * np.arange(size) for size in heights.shape[1:])
+    shown = np.ix_((y >= 3.0) & (y <= 5.0), (x >= 3.6) & (x <= 7.6))
+    light, limits = LightSource(azdeg=315, altdeg=35), Normalize(-0.8, 0.8)
+    for number, (row, grid) in enumerate(zip(genes, heights, strict=True), 1):
+        axes: Any = figure.add_subplot(3, -(-len(genes) // 3), number, projection="3d")
+        part, (across, along) = grid[shown], np.meshgrid(y[shown[0].ravel()], x[shown[1].ravel()], indexing="ij")
+        colours = light.shade(part, colormaps["cividis"], norm=limits, dx=SPACING, dy=SPACING, blend_mode="soft")
+        axes.plot_surface(along, across, part, facecolors=colours, rstride=1, cstride=1, lw=0, antialiased=False)
+        axes.set(zlim=(-0.8, 0.8))
+        axes.set_title(textwrap.fill(course.describe(row), 36), fontsize=9, y=1.06)
+        axes.set_box_aspect((np.ptp(along), np.ptp(across), 1.6), zoom=1.25)
+        axes.view_init(elev=28, azim=-125)
+        axes.set_axis_off()
+    return figure
+
+
+def draw_loop() -> Figure:
+    """A search as a loop: who hands what to whom."""
+    figure = new_figure(9, 3.0)
+    axes = figure.subplots()
+    boxes = {
+        "emitters": (0.0, 1.0, "method of search\nvaries elites; networks\njudge what it asks for"),
+        "terrains": (1.0, 1.0, "terrains\ngenes become heights"),
+        "robots": (2.0, 1.0, "crossings\n32,000 robots at once,\nthe controller a black box"),
+        "scores": (2.0, 0.0, "penalties\nhow badly, how reliably,\nin which shares"),
+        "archive": (1.0, 0.0, "archive\na cell for each way to struggle\nkeeps the hardest terrain"),
+        "faults": (0.0, 0.0, "judged at the end\nfresh episodes, finer physics,\nother controllers, MuJoCo C"),
+    }
+    for x, y, words in boxes.values():
+        box = {"boxstyle": "round,pad=0.5", "fc": "0.95", "ec": "C0"}
+        axes.text(x, y, words, ha="center", va="center", fontsize=8, bbox=box)
+    way = ("emitters", "terrains", "robots", "scores", "archive", "faults")
+    for begin, end in (*itertools.pairwise(way), ("archive", "emitters")):
+        (x0, y0, _), (x1, y1, _) = boxes[begin], boxes[end]
+        step = np.array([0.36 * np.sign(x1 - x0) * (y0 == y1), 0.26 * np.sign(y1 - y0)])  # leaves room for both boxes
+        arrow = {"arrowstyle": "-|>", "color": "C0", "lw": 1.5}
+        axes.annotate("", np.array([x1, y1]) - step, np.array([x0, y0]) + step, arrowprops=arrow)
+    axes.set(xlim=(-0.5, 2.5), ylim=(-0.45, 1.45))
+    axes.set_axis_off()
+    return figure
+
+
 def main() -> None:
     """Makes the pictures that the command line names, all without any."""
-    wanted = sys.argv[1:] or ["film", "conditions", "stills", "pages", "curves"]
+    wanted = sys.argv[1:] or ["film", "conditions", "stills", "pages", "curves", "drawings"]
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
         save(FOLDER / "fault.gif", as_gif(pictures), "Film")
@@ -168,9 +231,13 @@ def main() -> None:
         film_conditions()
     if "stills" in wanted and (course := course_source()) is not None:
         take_still(course, "course")
+    if "drawings" in wanted:
+        save_figure(FOLDER / "elements.png", draw_elements())
+        save_figure(FOLDER / "loop.png", draw_loop())
     if "curves" in wanted:
         save_figure(FOLDER / "noise.png", draw_noise())
         save_figure(FOLDER / "growth.png", draw_growth())
+        save_figure(FOLDER / "axes.png", draw_archive(read_archive(Path("results/cassie/archive_cma_mae"))))
         save_figure(FOLDER / "left.png", draw_left())
     if "pages" in wanted:
         subprocess.run([sys.executable, "-m", "tests.qd.show.view.browser"], check=True)

@@ -296,9 +296,16 @@ def test_tables_of_witnesses_tell_certificates_by_controllers_from_others(monkey
     monkeypatch.setattr(docs, "ROBOTS", {"dog": "Dog"})
     held = {"hold": 5, "tried": 6, "strong": {"hold": 2, "tried": 3}}
     monkeypatch.setattr(docs, "ROBOTS", {"dog": "Dog"})
-    monkeypatch.setattr(docs, "read", lambda file: {"dog": {"archive": {}}, "faults_mujoco_c": held})
-    cell = "5 of 6; strong: 2 of 3"
-    assert docs.archives().splitlines()[-1] == f"| ... that hold in MuJoCo C, of some | {cell} | {cell} | - |"
+    files = {"results/dog/archive/archive.json": {"faults_mujoco_c": held, "elites": 9, "wall_s": 90.0, "robot": "dog"}}
+    files |= {"results/dog/archive_cma_mae/archive.json": {"elites": 8, "wall_s": 1800.0, "episodes": 5}}
+    monkeypatch.setattr(docs, "PAPER", "paper")
+    monkeypatch.setattr(docs, "read", lambda file: files.get(file, {"dog": {"archive": {"elites": 7, "hours": 2}}}))
+    assert docs.archives().splitlines()[-1] == "| ... that hold in MuJoCo C, of some | 5 of 6; strong: 2 of 3 | - |"
+    assert docs.first().splitlines()[2:] == [
+        "| elites of 4 million episodes, each the hardest of its kind | 9 in 2 minutes |",
+        "| ... in the paper | 7 in 120 minutes |",
+    ]
+    assert docs.paper_archives().splitlines()[2:] == ["| elites | 8 | 7 |", "| hours | 0.5 | 2.0 |"]
 
 
 def test_tables_of_searches_have_a_sign_where_they_are_differences(monkeypatch):
