@@ -24,7 +24,6 @@ class Stream(IntEnum):
     MINIMISED_FRESH = 12
     CROSSED = 13
     FRESH_AGAIN = 1001  # of results/make/search_noise.py
-    RESIDUAL = 1002  # of results/make/residual.py
     ABOUT_CONDITIONS = 2000  # of results/make/conditions.py
 
 

@@ -26,14 +26,11 @@ for robot in "${robots[@]}"; do
   done
   make_file "$folder/witness.json" witness "$robot"                   # 10 min
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
-  make_file "$folder/residual.json" residual "$robot"                 # 6 min
   make_file "$folder/agreement.json" agreement "$robot"               # 20 min, most of it MuJoCo C on 16 cores
   make_file "$folder/search.json" search "$robot"                     # 70 min: 17 searches
   make_file "$folder/crossed.json" crossed "$robot"                   # 25 min: eight searches
-  make_file "$folder/left.json" left "$robot"                         # 1 min: of four of these
   make_file "$folder/search_noise.json" search_noise "$robot"         # 40 min: 18 searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
-  make_file "$folder/recipes.json" recipes "$robot"                   # 10 min: three trainings
   make_file "$folder/rounds.json" rounds "$robot"                     # 110 min
   make_file "$folder/tables_paper_sizes.json" tables "$robot"         # 40 min: twelve trainings
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU

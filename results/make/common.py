@@ -196,17 +196,20 @@ def follow_search(
     points: Sequence[int],
     counts: Sequence[str],
     last_stages: Sequence[str] = ("fresh",),
+    certifiers: Mapping[str, str] | None = None,
 ) -> list[dict[str, Any]]:
     """Extends a search to each number of iterations of ``points``, where its elites cross fresh episodes.
 
-    At the last point the search is judged by ``last_stages``. Returns ``counts`` of each point. The run's curve.json
+    At the last point the search is judged by ``last_stages``, and by ``certifiers`` if not by the robot's panel alone.
+    Returns ``counts`` of each point. The run's curve.json
     has them too, and its points are not searched again.
     """
     rows = {row["iterations"]: row for row in script.read_so_far(run / CURVE_FILE).get("curve", [])}
     for iterations in points:
         if iterations not in rows:
             search(replace(cfg, iterations=iterations), run, script.compute)
-            judge(run, stages=last_stages if iterations == points[-1] else ("fresh",), compute=script.compute)
+            stages = last_stages if iterations == points[-1] else ("fresh",)
+            judge(run, stages=stages, compute=script.compute, certifiers=certifiers)
             numbers = RunDirectory(run).read_summary()
             rows[iterations] = {"iterations": iterations, **{count: numbers.get(count) for count in counts}}
             write_atomically(run / CURVE_FILE, to_json({**script.origin, "curve": [*rows.values()]}))

@@ -252,23 +252,6 @@ def crossed_columns() -> dict[str, Column]:
     return {label: partial(cell, name=name) for label, name in columns.items()}
 
 
-def left() -> str:
-    """How many groups of failing elites and of faults searches see, and how many there are at least."""
-    rows = {
-        f"{label}, {name}, distance {least}": numbers[name] | groups
-        for label, numbers in read_robots("results/{}/left.json").items()
-        for name in ("failing", "faults")
-        for least, groups in numbers[name]["distances"].items()
-    }
-    columns: dict[str, Column] = {
-        "in all searches": "elites",
-        "groups that one search sees": lambda row: f"{row['growth'][0]:,.0f}",
-        "... that all see together": "groups",
-        "... that there are at least": "chao2",
-    }
-    return table(rows, columns)
-
-
 def training(measure: str = "goal") -> str:
     """Rates of every controller, on the set of another search first; goal rates have intervals."""
     sets = [name for name in reversed(SETS) if name != HELD_OUT[1]]
@@ -427,7 +410,6 @@ def searched_again() -> str:
         "base_searches": "base",
         "searches": "hardened",
         "at_once_searches": "at once",
-        "again_searches": "hardened again",
     }
     rows = {}
     for label, numbers in read_robots("results/{}/rounds.json").items():
@@ -694,7 +676,7 @@ TABLES: dict[str, Callable[..., str]] = {
         *(first, archives, paper_archives, beside_paper, training, goals, differences, methods, hardening),
         *(searched_again, spaces, sizes, agreement, minimal, packs, league, league_routes, films, drives, speed),
         *(kernels, conditions, condition_examples, condition_searches, map_training, witnesses, witness_curve),
-        *(crossed, crossed_weights, left),
+        *(crossed, crossed_weights),
     )
 }
 

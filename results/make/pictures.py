@@ -22,7 +22,6 @@ from PIL import Image
 
 from kernels.course import GENES_PER_ELEMENT, SPACING
 from kernels.episode import Outcome
-from qd.faults.families import KIN_M
 from qd.faults.searches import controllers_in
 from qd.search.archive import read_archive
 from qd.show.crossed import find_typical_episode, make_title
@@ -31,7 +30,7 @@ from qd.show.figures import draw_archive, save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
 from qd.show.replay import ReplaySource, save, source_from_map, source_from_run
 from results.make.common import runs_of_today
-from results.make.docs import PAPER, ROBOTS, least_minimum, read, read_robots
+from results.make.docs import PAPER, ROBOTS, least_minimum, read
 from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
 from sim.rates import typical_outcome
@@ -143,30 +142,6 @@ def draw_growth() -> Figure:
     return figure
 
 
-def draw_left() -> Figure:
-    """Groups of failing elites and of faults over the searches that see them, and Chao2."""
-    files = read_robots("results/{}/left.json")
-    figure = new_figure(12, 6.0)
-    grid = figure.subplots(2, len(files), sharex=True, squeeze=False)
-    for column, (robot, content) in zip(grid.T, files.items(), strict=True):
-        for axes, (name, words) in zip(column, {"failing": "failing elites", "faults": "faults"}.items(), strict=True):
-            axes.set(title=f"{robot}: {words}", ylabel="groups", yscale="log")
-            for number, (least, numbers) in enumerate(content[name]["distances"].items()):
-                searches, color = np.arange(1, len(numbers["growth"]) + 1), f"C{number}"
-                label = f"{100 * KIN_M * float(least):.0f} cm apart"
-                axes.plot(searches, numbers["growth"], marker=".", color=color, label=f"seen, {label}")
-                axes.axhline(numbers["chao2"], ls="--", color=color, label=f"lower bound (Chao2), {label}")
-                if numbers["chao2_interval"]:
-                    axes.axhspan(*numbers["chao2_interval"], color=color, alpha=0.12, lw=0)
-            axes.yaxis.set_major_formatter("{x:,.0f}")
-            axes.set_xticks(searches)
-            axes.grid(alpha=0.3)
-        column[-1].set_xlabel("searches")
-    title = "lower bounds for what this search can find"
-    figure.legend(*axes.get_legend_handles_labels(), fontsize=8, loc="outside right center", title=title)
-    return figure
-
-
 def draw_elements() -> Figure:
     """Every element of a course but flat ground, each alone, and as hard as it is there."""
     course = Course()
@@ -213,9 +188,9 @@ def draw_loop() -> Figure:
     way = ("emitters", "terrains", "robots", "scores", "archive", "faults")
     for begin, end in (*itertools.pairwise(way), ("archive", "emitters")):
         (x0, y0, _), (x1, y1, _) = boxes[begin], boxes[end]
-        step = np.array([0.36 * np.sign(x1 - x0) * (y0 == y1), 0.26 * np.sign(y1 - y0)])  # leaves room for both boxes
-        arrow = {"arrowstyle": "-|>", "color": "C0", "lw": 1.5}
-        axes.annotate("", np.array([x1, y1]) - step, np.array([x0, y0]) + step, arrowprops=arrow)
+        aside, up = 0.36 * np.sign(x1 - x0) * (y0 == y1), 0.26 * np.sign(y1 - y0)  # leaves room for both boxes
+        ends: Any = {"xy": (x1 - aside, y1 - up), "xytext": (x0 + aside, y0 + up)}
+        axes.annotate("", **ends, arrowprops={"arrowstyle": "-|>", "color": "C0", "lw": 1.5})
     axes.set(xlim=(-0.5, 2.5), ylim=(-0.45, 1.45))
     axes.set_axis_off()
     return figure
@@ -238,7 +213,6 @@ def main() -> None:
         save_figure(FOLDER / "noise.png", draw_noise())
         save_figure(FOLDER / "growth.png", draw_growth())
         save_figure(FOLDER / "axes.png", draw_archive(read_archive(Path("results/cassie/archive_cma_mae"))))
-        save_figure(FOLDER / "left.png", draw_left())
     if "pages" in wanted:
         subprocess.run([sys.executable, "-m", "tests.qd.show.view.browser"], check=True)
 

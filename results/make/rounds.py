@@ -1,10 +1,9 @@
-"""Rounds of hardening, and how much the count of faults differs between searches of one controller: rounds.json.
+"""Hardening in rounds against one training of as many steps, and how many faults each leaves: rounds.json.
 
-The base and the last controller are searched three times more, each with a specialist of its own. The last one is
-published as results/<robot>/hardened.pt. Beside it one training on the published archive alone, of as many steps as
-all rounds together, is searched as often, and crosses the sets of tables.py: tables_at_once.json. Three rounds more of
-the last controller were not planned: they were begun when its further searches had found more than a quarter of the
-base's faults.
+There are three hardenings and three trainings at once, on the published archive; all have the same sizes. The last
+controller of each is searched once, the base by three seeds, each time with a specialist of its own. The first
+hardening's is published as results/<robot>/hardened.pt, and crosses the sets of tables.py beside the first one that was
+trained at once: tables_at_once.json.
 """
 
 from collections.abc import Sequence
@@ -14,51 +13,24 @@ from typing import Any
 
 from qd.search.loop import search
 from results.make.archive import judge_with_specialist
-from results.make.common import COUNTS, Script, parse, publish_controller, read_made
+from results.make.common import COUNTS, SEEDS, Script, parse, publish_controller, read_made
 from results.make.tables import train, write_tables
 from train.cfg import HardenCfg
 from train.harden import ROUNDS_FILE, harden
 
 EPISODES = 416_000
-SEEDS = (1000, 1001, 1002)
-"""Of the further searches, which are as long as those of the rounds, and whose seeds are far from theirs."""
-MADE = ("command", "commit", "device", "date")
-"""Of a hardening, which is older than the file."""
-TRAINED, COMPARED = ("hardening", "at_once", "again"), "hardening and at_once"
-SEARCHES = {f"{name} {seed}": (name, seed) for name in ("base", *TRAINED) for seed in SEEDS}
+SEARCH_SEEDS = 1000
+"""Of the further searches, which are as long as those of the rounds: this and the next, far from the rounds' own."""
+KEYS = {"base": "base_searches", "hardening": "searches", "at_once": "at_once_searches"}
+"""Of the searches of each controller in the file."""
+TRAININGS = {f"{name} {seed}": (name, seed) for name in ("hardening", "at_once") for seed in SEEDS}
+SEARCHES = {f"search {name} {seed}": (name, seed) for name in KEYS for seed in SEEDS}
+COMPARED = "compare"
 
 
-def read_hardening(script: Script, name: str = "hardening") -> tuple[dict[str, Any], bool]:
-    """What the rounds.json of a hardening says so far, and whether all its rounds are done."""
-    made = read_made(script.runs / name / ROUNDS_FILE)
-    return made, len(made.get("rounds", ())) > cfg_of(script).rounds
-
-
-def last_policy(script: Script, name: str = "hardening") -> Path | None:
-    """File of the last training of a hardening that was kept; None if there is none."""
-    run, (made, is_done) = script.runs / name, read_hardening(script, name)
-    rounds = made.get("rounds", ())
-    if not is_done:
-        raise ValueError(f"{run} must hold a finished hardening, got {len(rounds)} searches: run the part {name} first")
-    kept = [row["tuned"] for row in rounds if row["kept"]]
-    return run / kept[-1] / "policy.pt" if kept else None
-
-
-def search_again(script: Script, name: str, policy: Path | None, seed: int) -> dict[str, Any]:
-    """Counts of another search of a controller, as long as those of a hardening; of the shipped one if None."""
-    run = script.runs / "rounds" / f"{name}-{seed}"
-    cfg = script.search_cfg(episodes=EPISODES, seed=seed, policy=None if policy is None else str(policy))
-    search(cfg, run, script.compute)
-    counts = judge_with_specialist(script, run)
-    return {"seed": seed, **{key: counts.get(key) for key in COUNTS}}
-
-
-def cfg_of(script: Script) -> HardenCfg:
-    """Settings of the hardening, in a trial of one tiny round.
-
-    Specialists judge the further searches alone, since no training needs them.
-    """
-    cfg = replace(HardenCfg.of(script.robot), seed=script.seed, specialists=False)
+def cfg_of(script: Script, seed: int) -> HardenCfg:
+    """Settings of a hardening, in a trial of one tiny round; specialists judge the further searches alone."""
+    cfg = replace(HardenCfg.of(script.robot), seed=seed, specialists=False)
     if not script.small:
         return cfg
     tune = replace(cfg.tune, num_envs=4, terrains=4, iterations=1)
@@ -66,64 +38,75 @@ def cfg_of(script: Script) -> HardenCfg:
     return replace(cfg, rounds=1, search=replace(cfg.search, episodes=16), tune=tune, evaluation=evaluation)
 
 
-def train_at_once(script: Script) -> Path:
-    """A controller that has the steps of all rounds in one training, on the published archive."""
-    cfg = cfg_of(script)
-    tune = cfg.sized_tune(script.robot, script.device)
-    tune = replace(tune, iterations=cfg.rounds * tune.iterations)
-    return Path(train(script, tune, "C-G", script.seed, script.runs / "at_once"))
+def run_of(script: Script, name: str, seed: int) -> Path:
+    """The run of a training."""
+    return script.runs / f"{name}-{seed}"
 
 
-def harden_here(script: Script, name: str = "hardening") -> dict[str, Any]:
-    """All rounds of a hardening, or of one again of its last controller; those that are done are read."""
-    made, is_done = read_hardening(script, name)
-    if is_done:
+def harden_here(script: Script, seed: int) -> dict[str, Any]:
+    """All rounds of a hardening; those that are done are read."""
+    run, cfg = run_of(script, "hardening", seed), cfg_of(script, seed)
+    made = read_made(run / ROUNDS_FILE)
+    if len(made.get("rounds", ())) > cfg.rounds:
         return made
-    cfg, certifiers = cfg_of(script), {} if script.small else None
-    if name == "again":
-        cfg = replace(cfg, policy=str(last_policy(script) or script.policy), seed=script.seed + 1)
-    return harden(script.robot, cfg, script.runs / name, script.compute, certifiers=certifiers)
+    return harden(script.robot, cfg, run, script.compute, certifiers={} if script.small else None)
+
+
+def controller_of(script: Script, name: str, seed: int) -> Path | None:
+    """What a training made: of a hardening the last controller that was kept, None where none was; None of the base."""
+    if name == "base":
+        return None
+    run = run_of(script, name, seed)
+    if name == "at_once":
+        cfg = cfg_of(script, seed)
+        tune = cfg.sized_tune(script.robot, script.device)
+        return Path(train(script, replace(tune, iterations=cfg.rounds * tune.iterations), "C-G", seed, run))
+    kept = [row["tuned"] for row in harden_here(script, seed)["rounds"] if row["kept"]]
+    return run / kept[-1] / "policy.pt" if kept else None
+
+
+def search_again(script: Script, name: str, seed: int) -> dict[str, Any]:
+    """Counts of another search of a controller, as long as those of a hardening."""
+    policy = controller_of(script, name, seed)
+    run = script.runs / "rounds" / f"{name}-{seed}"
+    named = None if policy is None else str(policy)
+    search(script.search_cfg(episodes=EPISODES, seed=SEARCH_SEEDS + seed, policy=named), run, script.compute)
+    counts = judge_with_specialist(script, run)
+    return {"seed": SEARCH_SEEDS + seed, **{key: counts.get(key) for key in COUNTS}}
+
+
+def compare(script: Script) -> None:
+    """The first of both trainings on the sets of the tables."""
+    hardened = controller_of(script, "hardening", SEEDS[0])
+    controllers = {"at_once": str(controller_of(script, "at_once", SEEDS[0])), "hardened": str(hardened)}
+    if hardened is not None:
+        write_tables(replace(script, out=script.results / "tables_at_once.json"), controllers)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
-    """Hardens in three rounds, and searches both ends and the one training again; a trial has one round alone.
-
-    Parts are the trainings, and each search by what it is of and its seed; those of a hardening come after it.
-    Where no round is kept there is nothing to search again.
-    """
-    all_parts = (*TRAINED, *SEARCHES, COMPARED)
+    """Trains, searches and compares; parts are each of these alone. A trial has one tiny hardening."""
+    all_parts = (*TRAININGS, *SEARCHES, COMPARED)
     script = parse(__doc__, argv, "rounds.json", parts=all_parts)
     parts = script.parts or (all_parts[:1] if script.small else all_parts)
-    hardenings = {name: harden_here(script, name) for name in ("hardening", "again") if name in parts}
-    if "at_once" in parts:
-        train_at_once(script)
-    searches: dict[str, list[dict[str, Any]]] = {name: [] for name in ("base", *TRAINED)}
+    for name, seed in (TRAININGS[part] for part in parts if part in TRAININGS):
+        controller_of(script, name, seed)
+    searches: dict[str, list[dict[str, Any]]] = {key: [] for key in KEYS.values()}
     for name, seed in (SEARCHES[part] for part in parts if part in SEARCHES):
-        policy = None if name == "base" else train_at_once(script) if name == "at_once" else last_policy(script, name)
-        if name == "base" or policy is not None:
-            searches[name].append(search_again(script, name, policy, seed))
-    if COMPARED in parts and (policy := last_policy(script)) is not None:
-        controllers = {"at_once": str(train_at_once(script)), "hardened": str(policy)}
-        write_tables(replace(script, out=script.results / "tables_at_once.json"), controllers)
+        searches[KEYS[name]].append(search_again(script, name, seed))
+    if COMPARED in parts:
+        compare(script)
     if script.parts:
         return searches
-    hardened = last_policy(script)
+    hardenings = [harden_here(script, seed) for seed in SEEDS[: 1 if script.small else None]]
     if not script.small:
-        for old in (script.results / "hardened.pt", script.results / "hardened.train.json"):
-            old.unlink(missing_ok=True)
-        if hardened is not None:
+        for old in script.results.glob("hardened.*"):
+            old.unlink()
+        if (hardened := controller_of(script, "hardening", SEEDS[0])) is not None:
             publish_controller(script, hardened, "hardened")
-    return script.write(
-        {
-            **{name: value for name, value in hardenings["hardening"].items() if name not in script.origin},
-            "hardenings": {name: {key: made[key] for key in MADE} for name, made in hardenings.items()},
-            "searches": searches["hardening"],
-            "base_searches": searches["base"],
-            "at_once_searches": searches["at_once"],
-            "again_rounds": hardenings.get("again", {}).get("rounds", []),
-            "again_searches": searches["again"],
-        }
-    )
+    made = ("command", "commit", "device", "date", "rounds", "choices")
+    first = {name: value for name, value in hardenings[0].items() if name not in script.origin}
+    rows = [{key: hardening[key] for key in made} for hardening in hardenings]
+    return script.write({**first, "hardenings": rows, **searches})
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from tests.qd.stand_in import Stub, make_result, result_of
 
 MAKE = Path(common.__file__).parent
 SCRIPTS = (
-    "agreement", "base", "conditions", "crossed", "dose", "left", "map_training", "minimal", "pack", "penalty_ratios",
+    "agreement", "base", "conditions", "crossed", "dose", "map_training", "minimal", "pack", "penalty_ratios",
     "search", "search_noise", "spaces", "speed", "tables", "witness",
 )  # fmt: skip
 """Those that call all that the others call."""
@@ -314,8 +314,6 @@ def test_tables_of_searches_have_a_sign_where_they_are_differences(monkeypatch):
     searches = [{"weight": 0.0, "failing": 7}, {"weight": 0.8, "failing": 8}, {"weight": 0.8, "failing": 9}]
     weights = {"0": counts, "0.8": counts | {"failing": 1234.5}}
     numbers = {"chosen": 0.8, "weights": weights, "difference": difference, "searches": searches}
-    groups = {"growth": [2.4, 4.0], "groups": 4, "chao2": 5.5, "chao2_interval": [4.2, 9.0]}
-    numbers |= {name: {"elites": 6, "distances": {"1": groups}} for name in ("failing", "faults")}
     monkeypatch.setattr(docs, "read_robots", lambda file: {"Dog": numbers})
     assert docs.crossed().splitlines()[2:] == [
         "| Dog, without | 100 (90 to 1,100) | 0.500 |",
@@ -323,7 +321,6 @@ def test_tables_of_searches_have_a_sign_where_they_are_differences(monkeypatch):
         "| Dog, difference | -5 | +0.125 (-0.250 to +0.500) |",
     ]
     assert docs.crossed_weights().splitlines()[2:] == ["| Dog, weight 0 | 7 |", "| Dog, weight 0.8 | 8 |"]
-    assert docs.left().splitlines()[2] == "| Dog, failing, distance 1 | 6 | 2 | 4 | 6 (4 to 9) |"
 
 
 def test_tables_of_conditions_have_both_searches(monkeypatch):
@@ -364,7 +361,7 @@ def test_the_table_of_trainings_with_errors_of_the_map_has_the_base_and_means(mo
 
 def test_a_table_without_its_file_is_empty(monkeypatch):
     monkeypatch.setattr(docs, "read", lambda file: {})
-    tables = (docs.witnesses, docs.witness_curve, docs.crossed, docs.crossed_weights, docs.left, docs.league)
+    tables = (docs.witnesses, docs.witness_curve, docs.crossed, docs.crossed_weights, docs.league)
     tables += (docs.conditions, docs.condition_searches, docs.map_training, docs.league_routes)
     assert {make() for make in tables} == {docs.table({}, {})}
 
