@@ -18,7 +18,7 @@ from sim.device import host_device
 from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
-_BUNDLE = 8  # strips, few enough that one thread looks at all
+_BUNDLE = 32  # strips at most, few enough that one thread looks at all where they are near the ground
 _vec3: Any = wp.vec3
 
 
