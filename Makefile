@@ -104,7 +104,7 @@ docs: setup ## Write the tables of README and docs/ anew from the results
 pictures: setup ## Make the pictures of README and docs/ anew: some minutes, a browser
 	$(BIN)/python -m results.make.pictures
 
-release-check: setup ## Name the published files that are not of this checkout's sources
+release-check: setup ## Name the files below results/ that this checkout's sources did not make
 	$(BIN)/python -m results.make.common
 
 test: $(TEST) ## Run the quick tests: some minutes on two cores

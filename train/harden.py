@@ -201,7 +201,10 @@ class _Hardening:
         cfg = preset(named, self.robot, policy, space=self.space.name, space_sha256=self.space.sha256)
         usual = _GPU_EPISODES if on_cuda else cfg.iterations * cfg.episodes_per_iteration
         iterations = -(-(size.episodes or usual) // cfg.episodes_per_iteration)
+        run = RunDirectory(self.path / f"search-{number}")
         crossed = usual_crossed(cfg.scheduler, self.robot, self.space)
+        if run.exists():  # it goes on as it was begun
+            crossed = run.read_cfg().fitness.crossed
         fitness = replace(cfg.fitness, crossed=crossed)
         return replace(cfg, seed=self._seed(number), iterations=iterations, fitness=fitness)
 

@@ -352,11 +352,14 @@ def _read_judged(searches: Sequence[Search]) -> list[Archive]:
             rule = f"runs of one pack must search one controller of one robot in one space, as {first.run} does"
             raise ValueError(f"{rule}, got {search.run} with {search.policy} in {search.cfg.space}: leave it out")
         archive = search.read_archive()
-        crossed = archive.resolved_outcomes.any(axis=1) & archive.certifier_outcomes.any(axis=(1, 2))
+        crossed = archive.resolved_outcomes.any(axis=1)
+        if archive.witnesses is None:  # else ways were sought
+            crossed &= archive.certifier_outcomes.any(axis=(1, 2))
         if archive.fresh is None or (archive.failing & ~crossed).any():
-            rule = "must have its failing elites crossed with contact resolved and by other controllers"
+            rule = "must have its failing elites crossed with contact resolved and by other controllers, or steered"
             got = f"{(archive.failing & crossed).sum()} of {archive.failing.sum()}"
-            raise ValueError(f"{search.run} {rule}, got {got}: run `faultline judge` on it first, with --certifiers")
+            remedy = "run `faultline judge` on it first, with --certifiers or the stage steered"
+            raise ValueError(f"{search.run} {rule}, got {got}: {remedy}")
         archives.append(archive)
     return archives
 

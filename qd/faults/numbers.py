@@ -114,13 +114,13 @@ def fault_numbers(archive: Archive) -> dict[str, Any]:
     if names or witnesses is not None:
         counts["certified"] = archive.certified
     if (names or witnesses is not None) and resolved.any():
-        in_panel = np.array(names, np.str_) != SPECIALIST
+        in_panel = np.array([not name.startswith(SPECIALIST) for name in names], bool)
         is_fault, by_controllers = archive.is_fault, archive.certified_by_controllers
         counts |= {} if in_panel.all() and witnesses is None else {"faults": is_fault}
         counts |= {} if witnesses is None else {"faults_witness": is_fault & ~by_controllers}
         counts["faults_panel"] = is_fault & certificates[:, in_panel].any(axis=1)
         counts["faults_controllers"] = is_fault & by_controllers
-        counts |= {"strong": archive.strong, "faults_fdr": is_fault & find_significant(archive)}
+        counts |= {"strong": archive.strong, "faults_fdr": is_fault & by_controllers & find_significant(archive)}
         numbers["fault_families"] = count_families(is_fault)
         numbers["fault_families_controllers"] = count_families(is_fault & by_controllers)
         if archive.varied is not None:

@@ -27,11 +27,11 @@ for robot in "${robots[@]}"; do
   make_file "$folder/witness.json" witness "$robot"                   # 10 min
   make_file "$folder/archive/minimal.json" minimal "$robot"           # 10 min
   make_file "$folder/agreement.json" agreement "$robot"               # 20 min, most of it MuJoCo C on 16 cores
-  make_file "$folder/search.json" search "$robot"                     # 70 min: 17 searches
+  make_file "$folder/search.json" search "$robot"                     # 45 min: 45 searches
   make_file "$folder/crossed.json" crossed "$robot"                   # 25 min: eight searches
   make_file "$folder/search_noise.json" search_noise "$robot"         # 40 min: 18 searches
   make_file "$folder/ablation.json" ablation "$robot"                 # 13 min
-  make_file "$folder/rounds.json" rounds "$robot"                     # 110 min
+  make_file "$folder/rounds.json" rounds "$robot"                     # 150 min: six trainings, nine searches
   make_file "$folder/tables_paper_sizes.json" tables "$robot"         # 40 min: twelve trainings
   make_file "$folder/distances.json" distances "$robot"               # 1 min, no GPU
   make_file "$folder/dose-resolved.json" dose "$robot"                # 5 min

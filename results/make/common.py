@@ -125,11 +125,8 @@ class Script:
         return replace(cfg, iterations=iterations or cfg.iterations)
 
     def count_iterations(self, cfg: SearchCfg, *episodes: int) -> list[int]:
-        """Whole iterations of a search nearest to each number of episodes, labels included; one in a trial."""
-        if self.small:
-            return [1]
-        label = cfg.fitness.crossed > 0.0  # labels take an iteration's episodes
-        return [round(count / cfg.episodes_per_iteration) - label for count in episodes]
+        """Whole iterations of a search nearest to each number of episodes, without its labels; one in a trial."""
+        return [1] if self.small else [round(count / cfg.episodes_per_iteration) for count in episodes]
 
     def publish(self, run: Path, folder: Path, patterns: Sequence[str]) -> None:
         """Copies files of a run into a published folder; files of another archive that the run lacks are removed."""
@@ -350,12 +347,12 @@ def is_current(file: Path) -> bool:
 
 
 def find_older(files: Sequence[Path]) -> list[Path]:
-    """Published files that other sources made, of all where none is named; prints the commit of each."""
+    """Files that today's sources did not make whole, of all below results/ where none is named; says what made each."""
     named = files or [file for file in sorted(Path("results").rglob("*.json")) if "sources_sha256" in read_made(file)]
     older = [file for file in named if not is_current(file)]
     for file in older:
         commit = str(read_made(file).get("commit") or "no commit")[:8]
-        print(f"{file} is of {commit}, and not of today's sources: make it anew by results/make/all.sh")
+        print(f"{file} is of {commit}: it is of other sources, a trial, or not whole")
     return older
 
 

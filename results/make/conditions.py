@@ -94,7 +94,7 @@ def search_part(script: Script, name: str, seed: int) -> dict[str, Any]:
     folder = name if seed == SEEDS[0] else f"{name}-{seed}"
 
     def measure() -> dict[str, Any]:
-        cfg = script.search_cfg(episodes=EPISODES_SEARCHED, seed=seed, space=SPACES[name])
+        cfg = script.search_cfg(episodes=EPISODES_SEARCHED, seed=seed, crossed=0.0, space=SPACES[name])
         archive, numbers = search_space(script, folder, cfg)
         return {"search_seed": seed, **numbers, **needed_conditions(script, archive, folder)}
 

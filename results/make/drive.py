@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     crossers = {name: Crosser(robot, script.compute, cache=runs / "crossings") for name, robot in robots.items()}
     drives = dict[str, Any]()
     for drive, robot in robots.items():
-        cfg = replace(script, robot=robot).search_cfg(ITERATIONS, seed=script.seed)
+        cfg = replace(script, robot=robot).search_cfg(ITERATIONS, seed=script.seed, crossed=0.0)
         search(cfg, runs / drive, script.compute, robot=robot)
         archive = judge(runs / drive, stages=("fresh", "resolved"), compute=script.compute, robot=robot.spec)
         summary = RunDirectory(runs / drive).read_summary()

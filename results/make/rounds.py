@@ -68,6 +68,8 @@ def controller_of(script: Script, name: str, seed: int) -> Path | None:
 def search_again(script: Script, name: str, seed: int) -> dict[str, Any]:
     """Counts of another search of a controller, as long as those of a hardening."""
     policy = controller_of(script, name, seed)
+    if name == "hardening" and policy is None:
+        raise ValueError(f"hardening {seed} must have kept a round, got none: there is no controller to search")
     run = script.runs / "rounds" / f"{name}-{seed}"
     named = None if policy is None else str(policy)
     search(script.search_cfg(episodes=EPISODES, seed=SEARCH_SEEDS + seed, policy=named), run, script.compute)
@@ -77,10 +79,9 @@ def search_again(script: Script, name: str, seed: int) -> dict[str, Any]:
 
 def compare(script: Script) -> None:
     """The first of both trainings on the sets of the tables."""
-    hardened = controller_of(script, "hardening", SEEDS[0])
-    controllers = {"at_once": str(controller_of(script, "at_once", SEEDS[0])), "hardened": str(hardened)}
-    if hardened is not None:
-        write_tables(replace(script, out=script.results / "tables_at_once.json"), controllers)
+    if (hardened := controller_of(script, "hardening", SEEDS[0])) is not None:
+        controllers = {"at_once": str(controller_of(script, "at_once", SEEDS[0])), "hardened": str(hardened)}
+        write_tables(replace(script, out=script.out.with_name("tables_at_once.json")), controllers)
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

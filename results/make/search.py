@@ -4,6 +4,7 @@ Each is searched by five seeds, with every terrain crossed once, and where it ca
 default does. After each step all elites cross fresh episodes. At the end, those that fail cross with contact resolved,
 and are crossed by the robot's panel and by the specialists of both published archives: whatever found a terrain, the
 same controllers certify it. Methods of evolution have ten emitters, the paper's, with which they find more.
+The default's specialist and CMA-MAE's are among the certifiers, one of MAP-Elites or of random terrains is not.
 """
 
 from collections.abc import Sequence

@@ -32,7 +32,9 @@ def main(argv: Sequence[str] | None = None) -> dict[str, Any]:
     dose = script.read_dose(conditions=False)
     numbers = {}
     for name in SPACES:
-        _, numbers[name] = search_space(script, f"spaces/{name}", script.search_cfg(13, seed=script.seed, space=name))
+        _, numbers[name] = search_space(
+            script, f"spaces/{name}", script.search_cfg(13, seed=script.seed, crossed=0.0, space=name)
+        )
     return script.write({"spaces": numbers, "dose": dose})
 
 

@@ -18,7 +18,7 @@ from kernels.episode import PARKING_HEIGHT, Outcome
 from qd.evaluate.tables import terrain_rates
 from qd.search import loop
 from qd.workers import crosser
-from results.make import agreement, bare, common, docs, speed, tables
+from results.make import agreement, bare, common, docs, rounds, speed, tables
 from sim.files.provenance import sources_sha256
 from sim.rollout import Rollout
 from sim.terrains.hand_crafted import NUM_COLS, NUM_ROWS
@@ -278,6 +278,21 @@ def test_a_cell_is_a_number_with_its_interval():
     assert made.splitlines()[2:] == ["| cm | 50.0 (20.0 to 100.0) | 25.0 |", "| rate | 0.50 (0.20 to 1.00) | 0.25 |"]
 
 
+def test_a_hardening_that_kept_no_round_has_no_controller_to_search_or_compare(tmp_path, monkeypatch):
+    script = common.parse(None, ["--small", "--out", f"{tmp_path}/rounds.json"], "rounds.json")
+    kept = {
+        "rounds": [{"tuned": None, "kept": None}, {"tuned": "tune-1", "kept": True}, {"tuned": "tune-2", "kept": False}]
+    }
+    monkeypatch.setattr(rounds, "harden_here", lambda script, seed: kept if seed else {"rounds": kept["rounds"][::2]})
+    monkeypatch.setattr(rounds, "train", lambda *given: pytest.fail("it is trained for nothing"))
+    monkeypatch.setattr(rounds, "write_tables", lambda *given: pytest.fail("it is compared"))
+    assert [rounds.controller_of(script, name, 0) for name in ("base", "hardening")] == [None, None]
+    assert rounds.controller_of(script, "hardening", 1) == script.runs / "hardening-1" / "tune-1" / "policy.pt"
+    with pytest.raises(ValueError, match="hardening 0 must have kept a round"):
+        rounds.search_again(script, "hardening", 0)
+    rounds.compare(script)
+
+
 def test_tables_of_witnesses_tell_certificates_by_controllers_from_others(monkeypatch):
     found = {"tried": 9, "line": 3, "own_line": 2, "beside": 2, "around": 1}
     judged = {"witnesses": found, "fault_families": 6, "fault_families_controllers": 5, "faults_controllers": 4}
@@ -302,8 +317,10 @@ def test_tables_of_witnesses_tell_certificates_by_controllers_from_others(monkey
     monkeypatch.setattr(docs, "read", lambda file: files.get(file, {"dog": {"archive": {"elites": 7, "hours": 2}}}))
     assert docs.archives().splitlines()[-1] == "| ... that hold in MuJoCo C, of some | 5 of 6; strong: 2 of 3 | - |"
     assert docs.first().splitlines()[2:] == [
-        "| elites of 4 million episodes, each the hardest of its kind | 9 in 2 minutes |",
-        "| ... in the paper | 7 in 120 minutes |",
+        "| elites as found, in the paper | 7 |",
+        "| ... by the paper's method, here | 8 |",
+        "| ... by the default method | 9 |",
+        "| minutes that this search took | 2 |",
     ]
     assert docs.paper_archives().splitlines()[2:] == ["| elites | 8 | 7 |", "| hours | 0.5 | 2.0 |"]
 

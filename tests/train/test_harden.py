@@ -12,6 +12,7 @@ import torch
 from kernels.episode import Outcome
 from qd.evaluate.sets import generated_set, hash_elites, make_sets, read_trained_on, split_elites
 from qd.search.archive import read_archive, write_archive
+from qd.search.directory import RunDirectory
 from qd.workers.compute import Compute
 from sim.files.atomic import read_json, to_json
 from sim.files.command import Interrupted, run_command
@@ -36,7 +37,7 @@ class World:
 
     def __init__(self, *worse: str) -> None:
         self.worse, self.stop_in = worse, ""
-        self.searched, self.trained = {}, {}
+        self.searched, self.trained, self.asked = {}, {}, {}
 
     def _work(self, run) -> bool:
         """Whether there is work to do in a run; Ctrl-C comes in the middle of ``stop_in``."""
@@ -50,6 +51,7 @@ class World:
         return True
 
     def search(self, cfg, run, compute, **_) -> None:
+        self.asked[run.name] = cfg
         if self._work(run):
             self.searched[run.name] = (cfg.policy, cfg.seed, cfg.iterations)
             archive = replace(make_archive(20, seed=cfg.seed), policy_sha256=cfg.policy_sha256)
@@ -151,6 +153,19 @@ def test_stopped_it_comes_to_the_same_and_goes_on_for_more_rounds(hardened, plac
     assert (list(world.searched), list(world.trained)) == (["search-2"], ["tune-2"])
     with pytest.raises(ValueError, match="rounds"):
         hardened(World(), rounds=1)
+
+
+def test_what_nobody_crosses_earns_less_as_in_a_search_and_a_search_goes_on_as_it_was_begun(hardened, place):
+    world, wide = World(), {"rounds": 1, "search": RoundSearchCfg(preset="wide", episodes=64_000)}
+    world.stop_in = "search-0"
+    with pytest.raises(Interrupted):
+        hardened(world, **wide)
+    cfg = world.asked["search-0"]
+    assert (cfg.fitness.crossed, cfg.iterations) == (0.95, 2)
+    before = replace(cfg, fitness=replace(cfg.fitness, crossed=0.0))
+    RunDirectory(place / "run" / "search-0").begin_session(before, CPU.origin(0), 0)
+    hardened(world, **wide)
+    assert [world.asked[f"search-{number}"].fitness.crossed for number in range(2)] == [0.0, 0.95]
 
 
 @pytest.mark.slow

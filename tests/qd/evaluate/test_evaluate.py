@@ -20,7 +20,7 @@ from qd.evaluate.tables import is_regression
 from qd.faults.judge import judge
 from qd.faults.minimise import minimise
 from qd.faults.searches import find_search
-from qd.search.archive import read_archive, write_archive
+from qd.search.archive import no_witnesses, read_archive, write_archive
 from sim.controllers.spec import controller_identity
 from sim.files.command import run_command
 from sim.robots.robot import ROBOTS
@@ -185,6 +185,10 @@ def test_a_pack_is_made_of_a_judged_run(anymal, path, elites, tmp_path, monkeypa
     judge(path, stages=("resolved",), compute=compute)
     with pytest.raises(ValueError, match="judge"):  # nobody else crossed them
         make(base)
+    archive = read_archive(path)
+    write_archive(path, replace(archive, witnesses=no_witnesses(len(archive), 0.5)))
+    assert len(packs._read_judged([find_search(path)])) == 1  # but ways were sought
+    write_archive(path, archive)
     judge(path, stages=("others",), certifiers=OTHER, compute=compute)
     minimise(path, elite=" ".join(map(str, elites)), judged=True, certifiers=OTHER, compute=compute)
     assert not Path("pack").exists() and not robots.opened

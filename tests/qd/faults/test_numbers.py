@@ -54,7 +54,10 @@ def test_numbers_by_hand():
     assert pick_numbers(archive, *names) == (None,) * 4 and count_faults(archive) == 1
 
 
-@pytest.mark.parametrize(("certifiers", "expected"), [(("C-G", SPECIALIST), (1, 0)), ((SPECIALIST, "S"), (1, 1))])
+@pytest.mark.parametrize(
+    ("certifiers", "expected"),
+    [(("C-G", SPECIALIST), (1, 0)), (("C-G", f"{SPECIALIST} of another"), (1, 0)), ((SPECIALIST, "S"), (1, 1))],
+)
 def test_the_specialists_faults_count_beside_those_of_the_panel(certifiers, expected):
     archive = replace(judged_archive(), certifiers=certifiers)
     assert pick_numbers(archive, "faults", "faults_panel") == expected and count_faults(archive) == 1
