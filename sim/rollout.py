@@ -456,7 +456,8 @@ class Rollout:
         busy_steps = int(queue.busy.numpy().sum(dtype=np.int64)) * robot.decimation
         queue.busy.zero_()
         wall_s = time.perf_counter() - self._taken_s
-        self._step_s = min(self._step_s, wall_s / max(1, steps))
+        if steps >= self._poll:  # fewer say little
+            self._step_s = min(self._step_s, wall_s / steps)
         self._taken_at = self._step
         self._taken_s += wall_s
         return RolloutResult(
