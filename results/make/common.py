@@ -198,8 +198,7 @@ def follow_search(
     """Extends a search to each number of iterations of ``points``, where its elites cross fresh episodes.
 
     At the last point the search is judged by ``last_stages``, and by ``certifiers`` if not by the robot's panel alone.
-    Returns ``counts`` of each point. The run's curve.json
-    has them too, and its points are not searched again.
+    Returns ``counts`` of each point. The run's curve.json has them too, and its points are not searched again.
     """
     rows = {row["iterations"]: row for row in script.read_so_far(run / CURVE_FILE).get("curve", [])}
     for iterations in points:

@@ -102,13 +102,11 @@ def rate_table(rows: Mapping[str, tuple[str, str, str]], *, short: bool = False)
     return table(rows, {name: partial(rate, controller=name, short=short) for name in CONTROLLERS})
 
 
-def searches() -> dict[str, dict[str, Any]]:
-    """Counts of the published archives, by the default method and by the paper's, of each robot."""
-    rows = {}
-    for (robot, label), name in product(ROBOTS.items(), ("archive", "archive_cma_mae")):
-        if numbers := read(f"results/{robot}/{name}/archive.json"):
-            rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = numbers
-    return rows
+def read_archives(robot: str) -> dict[str, dict[str, Any]]:
+    """Counts of a robot's published archives by their labels: by the default method, and by the paper's."""
+    names = {"archive": "", "archive_cma_mae": ", CMA-MAE"}
+    files = {f"{ROBOTS[robot]}{words}": read(f"results/{robot}/{name}/archive.json") for name, words in names.items()}
+    return {label: numbers for label, numbers in files.items() if numbers}
 
 
 def first() -> str:
@@ -159,7 +157,8 @@ def archives() -> str:
         "families of all faults": "fault_families",
         "*distinct* faults": "faults_distinct",
     }
-    return table(searches(), columns, upright=True)
+    rows = {label: numbers for robot in ROBOTS for label, numbers in read_archives(robot).items()}
+    return table(rows, columns, upright=True)
 
 
 def paper_archives() -> str:
@@ -184,9 +183,9 @@ def witnesses() -> str:
     """Witnesses of the published archives, and how many plain crossings find by luck."""
     rows: dict[str, dict[str, Any]] = {}
     for robot, label in ROBOTS.items():
-        for name in ("archive", "archive_cma_mae"):
-            if found := (judged := read(f"results/{robot}/{name}/archive.json")).get("witnesses"):
-                rows[f"{label}{', CMA-MAE' * name.endswith('mae')}"] = judged | found | judged["judged_by"]["steered"]
+        for name, judged in read_archives(robot).items():
+            if found := judged.get("witnesses"):
+                rows[name] = judged | found | judged["judged_by"]["steered"]
         if numbers := read(f"results/{robot}/witness.json"):
             rows[f"{label}, plain crossings in their place"] = numbers["control"]
     columns: dict[str, Column] = {

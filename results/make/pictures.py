@@ -3,7 +3,8 @@
 ``film`` makes docs/pictures/fault.gif from terrains that are kept beside it, so that new archives do not change it; the
 robots' controllers of the day cross them. ``conditions`` films minimal examples of the published searches under
 conditions, and ``stills`` shows the worst course where its search is here (results.make.spaces).
-``pages`` takes the pictures of the viewer and of the report. ``curves`` draws what the published files say of searches.
+``pages`` takes the pictures of the viewer and of the report. ``curves`` draws what the published files say of searches,
+``drawings`` the elements of a course and the loop of a search.
 """
 
 import itertools
