@@ -22,9 +22,7 @@ from sim.rates import SUCCESS
 FRESH_EPISODES = 40  # episodes that each elite is evaluated again with
 EPISODES = 20  # episodes of an elite in each further stage of judging
 SEARCHED = "searched"  # name of the searched controller among those that are steered
-SPECIALIST = (
-    "specialist"  # so begin names of certifiers trained on what a search fails; all others form the panel
-)
+SPECIALIST = "specialist"  # so begin names of certifiers trained on what a search fails; all others form the panel
 
 TEMPLATES = open_templates(Path(__file__).parent / "templates")  # texts about elites
 _INVALID = OUTCOMES.index("invalid")
