@@ -154,7 +154,6 @@ def _run_iterations(
 
     pipeline.clear()
     began = time.perf_counter()
-    asking_s, saving_s = 0.0, 0.0  # what it took last
     for group in range(num_groups):
         put(ask(group, len(metrics) + 1), group, len(metrics) + 1)
     while (iteration := len(metrics) + 1) <= last:
@@ -162,8 +161,6 @@ def _run_iterations(
         num_new, search_s = 0, 0.0
         for group in range(num_groups):
             results.append(pipeline.take(bar.within(iteration - 1 + group / num_groups, 1 / num_groups)))
-            taken = time.perf_counter()
-            pipeline.go_on(asking_s)
             refuse_all_invalid(results[-1])
             evaluations.append(evaluate_rollout(results[-1], cfg.cells, cfg.fitness))
             if not metrics:
@@ -176,9 +173,6 @@ def _run_iterations(
             genes = ask(group, iteration + 1)
             search_s += time.perf_counter() - emitters_began
             put(genes, group, iteration + 1)
-            asking_s = time.perf_counter() - taken
-        asked = time.perf_counter()
-        pipeline.go_on(saving_s)
         archive = build_archive(cfg, scheduler, iteration)
         row = describe_metrics(archive, RolloutResult.join(results), join_evaluations(evaluations))
         if labeller is not None:
@@ -199,4 +193,3 @@ def _run_iterations(
         elites = f"{row['elites']:,} elites ({row['expected_same_cell']:,.0f} to stay)"
         speed = f"{row['episodes_per_s']:.0f} episodes/s{by}, fitness {row['mean_fitness']:.2f}"
         bar.move_to(iteration, f"iteration {min(iteration + 1, last)}/{last}: {elites}, {why}{speed}")
-        saving_s = time.perf_counter() - asked

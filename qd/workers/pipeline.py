@@ -175,11 +175,6 @@ class Pipeline:
         """Waits for the lot that was put in first; ``progress`` gets the share of it that is done."""
         return self._simulator.take(progress)
 
-    def go_on(self, seconds: float) -> None:
-        """Lets robots go on while this process does something else for so long, where it simulates on a GPU."""
-        if isinstance(self._simulator, Rollout):
-            self._simulator.go_on(seconds)
-
     def clear(self) -> None:
         """Drops all pending lots."""
         self._simulator.clear()
