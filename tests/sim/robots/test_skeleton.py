@@ -229,7 +229,7 @@ def test_every_geom_of_a_robot_has_probes_on_its_body(robot):
     builder = build_robot(robot)
     probes = make_probes(builder)
     shapes, starts, first = (getattr(probes, name).numpy() for name in ("strip_shape", "strip_start", "bundle_start"))
-    bodies = np.repeat(probes.bundle_body.numpy(), np.diff(first))
+    bodies = probes.strip_body.numpy()
     ball = np.repeat(probes.bundle_ball.numpy(), np.diff(starts[first]), axis=0)
     radius = np.repeat(probes.strip_radius.numpy(), np.diff(starts))
     away = np.linalg.norm(probes.position.numpy() - ball[:, :3], axis=1) + radius
