@@ -66,11 +66,15 @@ class Networks(nn.Module):
 
     def _through(self, maps: Tensor, layers: _Layers) -> Tensor:
         """Outputs of some networks for maps of each or of all, shape (batch, networks, num_out)."""
-        rows = maps.movedim(-1, 1)
-        for (size, strides, _), (weight, bias) in zip(_CONVOLUTIONS, layers, strict=False):
-            has_same_input = rows.shape[1] == weight.shape[2]  # for all networks
-            weight = weight.flatten(0, 1) if has_same_input else _block_diagonal(weight)
-            rows = _activated(rows, weight.to(rows.dtype), bias.flatten().to(rows.dtype), strides, size // 2)
+        (first_weight, first_bias), *further = layers
+        (size, strides, _), *convolutions = _CONVOLUTIONS
+        if maps.is_cuda:
+            rows = _slide_over(maps.movedim(-1, 1), first_weight.to(maps.dtype), first_bias.to(maps.dtype), strides)
+        else:
+            rows = _activated(maps.movedim(-1, 1), first_weight[0], first_bias[0], strides, size // 2)
+        for (size, strides, _), (weight, bias) in zip(convolutions, further, strict=False):
+            weight = _block_diagonal(weight).to(rows.dtype)
+            rows = _activated(rows, weight, bias.flatten().to(rows.dtype), strides, size // 2)
         (weight, bias), (last_weight, last_bias) = layers[-2:]
         weight, position_weight = weight.split([weight.shape[2] - _WAVES, _WAVES], dim=2)
         offsets = position_weight.flatten(2) @ self.get_buffer("_positions") + bias[..., None]  # the same in every row
@@ -84,9 +88,27 @@ def _activated(rows: Tensor, weight: Tensor, bias: Tensor, strides: tuple[int, i
     """A convolution and a ReLU; in half precision one kernel of cuDNN does both, without gradients."""
     if rows.dtype != torch.half:
         return nn.functional.conv2d(rows, weight, bias, strides, padding).relu()
-    if missing := -rows.shape[1] % 8:  # Tensor Cores take eight channels at once
-        rows, weight = (nn.functional.pad(x.movedim(1, -1), (0, missing)).movedim(-1, 1) for x in (rows, weight))
     return torch.cudnn_convolution_relu(rows, weight, bias, strides, (padding, padding), (1, 1), 1)
+
+
+def _slide_over(rows: Tensor, weight: Tensor, bias: Tensor, strides: tuple[int, int]) -> Tensor:
+    """The first convolution and a ReLU, as products of matrices: for so few channels cuDNN's kernels are slow.
+
+    Rows of networks are channels, maps of each behind the others'; or all networks have the same maps.
+    """
+    size, num_maps = weight.shape[-1], weight.shape[2]
+    missing = -size % 8  # Tensor Cores take eight numbers at once
+    weight = nn.functional.pad(weight, (0, missing))
+    rows = nn.functional.pad(rows, (size // 2, size // 2 + missing, size // 2, size // 2)).unflatten(1, (-1, num_maps))
+    windows = rows.unfold(3, size, strides[0]).unfold(4, size + missing, strides[1]).permute(0, 1, 3, 4, 2, 5, 6)
+    num_sets, *positions = windows.shape[1:4]  # sets of maps, of one network or of all
+    columns = windows.flatten(4).flatten(2, 3)
+    weight, bias = weight.flatten(2).reshape(num_sets, -1, columns.shape[-1]), bias.reshape(num_sets, -1)
+    if num_sets == 1:
+        found = nn.functional.linear(columns[:, 0], weight[0], bias[0])
+    else:
+        found = (columns @ weight.mT + bias[:, None]).movedim(1, 2).flatten(2)
+    return found.relu().unflatten(1, positions).movedim(-1, 1)
 
 
 def _block_diagonal(weight: Tensor) -> Tensor:

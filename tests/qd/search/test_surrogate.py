@@ -11,7 +11,7 @@ from qd.search.descriptors import Cells
 from qd.search.fitness import Evaluation, FitnessCfg, evaluate_rollout
 from qd.search.presets import SchedulerCfg
 from qd.search.surrogate import surrogate as module
-from qd.search.surrogate.networks import MEMBERS, Networks, Trainer
+from qd.search.surrogate.networks import MEMBERS, Networks, Trainer, _block_diagonal, _slide_over
 from qd.search.surrogate.surrogate import Prediction, Surrogate, label_loss, vary_elites
 from sim.terrains.conditions.likely import choose_likely, find_log_likelihood
 from sim.terrains.corridor import SHAPE, corridor_heights
@@ -172,6 +172,23 @@ def test_training_is_the_same_on_every_device_and_after_a_pickle(device, monkeyp
     expected, values = predicted(straight, genes), predicted(moved, genes)
     tolerance = 0.005 if moved.device.startswith("cuda") else 0.0
     np.testing.assert_allclose(values["ratios"], expected["ratios"], rtol=0.0, atol=tolerance)
+
+
+@pytest.mark.parametrize("num_maps", [1, 3])
+@pytest.mark.parametrize("same", [True, False])
+def test_the_first_layer_of_a_gpu_is_a_convolution(num_maps, same):
+    draw = torch.Generator().manual_seed(0)
+    sets = 1 if same else MEMBERS
+    rows = torch.randn((3, sets * num_maps, *SHAPE), generator=draw)
+    weight = torch.randn((MEMBERS, 12, num_maps, 5, 5), generator=draw, requires_grad=True)
+    bias = torch.randn((MEMBERS, 12), generator=draw, requires_grad=True)
+    joined = weight.flatten(0, 1) if same else _block_diagonal(weight)
+    expected = torch.nn.functional.conv2d(rows, joined, bias.flatten(), (3, 3), 2).relu()
+    found = _slide_over(rows, weight, bias, (3, 3))
+    assert found.is_contiguous(memory_format=torch.channels_last)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-5)
+    learned = (torch.autograd.grad((values**2).sum(), (weight, bias)) for values in (found, expected))
+    torch.testing.assert_close(*learned, atol=0.1, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["super_gaussian", "course+friction", "{own}+softness+push+delay"])

@@ -236,6 +236,7 @@ def test_every_geom_of_a_robot_has_probes_on_its_body(robot):
     assert (away <= ball[:, 3]).all()
     assert [builder.shape_label[shape] for shape in shapes] == builder.shape_label  # once: no cylinders, no boxes
     np.testing.assert_array_equal(bodies, np.array(builder.shape_body)[shapes])
+    np.testing.assert_array_equal(bodies, np.repeat(bodies[first[:-1]], np.diff(first)))  # the same in a bundle
     if robot.name == "cassie":
         # At r = .02 neighbours may be 2 sqrt(2 * .02 * .0005 - .0005^2) = .0089 m apart: 16 on a toe of .125 m.
         np.testing.assert_allclose(probes.strip_radius.numpy(), [0.25, 0.02, 0.02], atol=1e-6)
