@@ -1,13 +1,12 @@
 """Terrain contact: strips of sphere probes against height grids.
 
 A strip is a row of equal spheres on one collision shape, straight but for meshes (:mod:`sim.robots.probes` makes them).
-Some strips of a body that lie together are a bundle, in one ball: most are far from the ground. A first kernel finds
-the strips that are near it, a second one looks at their probes, with as many threads for each robot as read in turn
-what lies far apart in memory.
+Some strips of a body that lie together are a bundle, in one ball: most are far from the ground.
 Of the probes of a strip that touch, the first, the deepest and the last become contacts: a lying capsule rests on its
 two ends and on the highest point between, and a robot on its back cannot flood the solver.
 """
 
+import math
 from typing import Any
 
 import warp as wp
@@ -16,7 +15,7 @@ from kernels.ground import FIRM, Ground, patch_at
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
 from kernels.launch import kernel_over, launch_grid, least_float_of_lanes, least_of_lanes, make_zeros
 
-_GROUPS, _LANES = 8, 8  # strips of a robot that a GPU looks at beside each other, and threads for each
+_MAX_THREADS = 150_000  # that a GPU is given: where robots are few, several share the probes of a strip
 _NONE = wp.constant(2**30)
 vec5 = wp.types.vector(5, float)
 """MuJoCo's frictions of a contact, or an impedance."""
@@ -36,10 +35,10 @@ class Probes:
     """Largest distance of a strip's centres from the line between its ends [m], shape (num_strips,); 0 if straight."""
     strip_shape: wp.array[int]
     """Collision shape of each strip, counted within one robot, shape (num_strips,)."""
-    strip_body: wp.array[int]
-    """Body of each strip, the same in a bundle, counted within one robot, shape (num_strips,)."""
     bundle_start: wp.array[int]
     """First strip of each bundle, shape (num_bundles + 1,)."""
+    bundle_body: wp.array[int]
+    """Body of each bundle, counted within one robot, shape (num_bundles,)."""
     bundle_ball: wp.array[wp.vec4]
     """Ball round each bundle: its middle in the frame of the body, and its radius [m], shape (num_bundles,)."""
 
@@ -53,16 +52,6 @@ class Poses:
     """wxyz."""
     column_of_body: wp.array[int]
     """Column of each body of a robot, shape (bodies_per_env,); the base comes first."""
-
-
-@wp.struct
-class NearStrips:
-    """Strips of every robot that may touch the ground."""
-
-    count: wp.array[int]
-    """Shape (num_envs,)."""
-    strip: wp.array2d[int]
-    """In any order, shape (num_envs, num_strips)."""
 
 
 @wp.struct
@@ -131,56 +120,22 @@ def _write_contact(
 
 
 @wp.func
-def _read_pose(poses: Poses, env: int, body: int) -> wp.transform:
-    column = poses.column_of_body[body]
-    wxyz = poses.xquat[env, column]
-    return wp.transform(poses.xpos[env, column], wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
-
-
-@wp.func
-def _ceiling_of_strip(pose: wp.transform, strip: int, terrain: Terrain, t: int, probes: Probes) -> float:
-    """Upper bound [m] of the surface below a strip; -inf if that is too low for the strip to touch it."""
-    a = wp.transform_point(pose, probes.position[probes.strip_start[strip]])
-    b = wp.transform_point(pose, probes.position[probes.strip_start[strip + 1] - 1])
-    reach = probes.strip_radius[strip] + probes.strip_spread[strip]
-    lower = wp.vec2(wp.min(a[0], b[0]) - reach, wp.min(a[1], b[1]) - reach)
-    upper = wp.vec2(wp.max(a[0], b[0]) + reach, wp.max(a[1], b[1]) + reach)
-    ceiling = ceiling_over(terrain, t, lower, upper)
-    if wp.min(a[2], b[2]) - reach < ceiling:
-        return ceiling
-    return -wp.inf
-
-
-@wp.kernel
-def _find_near_strips_kernel(
-    poses: Poses, terrain_of_env: wp.array[int], terrain: Terrain, probes: Probes, parked: wp.array[int],
-    near_out: NearStrips,
-):  # fmt: skip
-    """Grid (num_bundles, num_envs): the threads of a warp look at the same part of different robots."""
-    bundle, env = wp.tid()
-    if parked[env] == 2:
-        return
-    t = terrain_of_env[env]
-    first = probes.bundle_start[bundle]
-    pose = _read_pose(poses, env, probes.strip_body[first])
-    ball = probes.bundle_ball[bundle]
-    middle = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
-    lower = wp.vec2(middle[0] - ball[3], middle[1] - ball[3])
-    upper = wp.vec2(middle[0] + ball[3], middle[1] + ball[3])
-    if not (middle[2] - ball[3] < ceiling_over(terrain, t, lower, upper)):
-        return  # also where the state is NaN
-    for strip in range(first, probes.bundle_start[bundle + 1]):
-        if _ceiling_of_strip(pose, strip, terrain, t, probes) > -wp.inf:
-            near_out.strip[env, wp.atomic_add(near_out.count, env, 1)] = strip
-
-
-@wp.func
 def _collide_strip(
     pose: wp.transform, strip: int, lane: int, lanes: int, terrain: Terrain, ground: Ground, t: int, env: int,
     probes: Probes, contacts_out: Contacts,
 ):  # fmt: skip
     radius = probes.strip_radius[strip]
-    ceiling = _ceiling_of_strip(pose, strip, terrain, t, probes)
+    begin = probes.strip_start[strip]
+    end = probes.strip_start[strip + 1]
+    a = wp.transform_point(pose, probes.position[begin])
+    b = wp.transform_point(pose, probes.position[end - 1])
+    reach = radius + probes.strip_spread[strip]
+    lowest = wp.min(a[2], b[2]) - reach
+    lower = wp.vec2(wp.min(a[0], b[0]) - reach, wp.min(a[1], b[1]) - reach)
+    upper = wp.vec2(wp.max(a[0], b[0]) + reach, wp.max(a[1], b[1]) + reach)
+    ceiling = ceiling_over(terrain, t, lower, upper)
+    if not (lowest < ceiling):
+        return
     first = int(_NONE)
     last = int(-1)
     deepest = int(_NONE)
@@ -188,7 +143,7 @@ def _collide_strip(
     of_first = SurfacePoint()
     of_last = SurfacePoint()
     of_deepest = SurfacePoint()
-    for k in range(probes.strip_start[strip] + lane, probes.strip_start[strip + 1], lanes):
+    for k in range(begin + lane, end, lanes):
         centre = wp.transform_point(pose, probes.position[k])
         if centre[2] - radius < ceiling:
             point = nearest_surface_point(terrain, t, centre, radius)
@@ -220,39 +175,46 @@ def _collide_strip(
 
 @wp.kernel
 def _collide_strips_kernel(
-    poses: Poses, terrain_of_env: wp.array[int], terrain: Terrain, probes: Probes, ground: Ground, near: NearStrips,
-    groups: int, lanes: int, contacts_out: Contacts,
-):  # fmt: skip
-    """Grid (num_envs, groups, lanes): each group of threads takes every so many of a robot's near strips."""
-    env, group, lane = wp.tid()
-    for k in range(group, near.count[env], groups):
-        strip = near.strip[env, k]
-        pose = _read_pose(poses, env, probes.strip_body[strip])
-        _collide_strip(pose, strip, lane, lanes, terrain, ground, terrain_of_env[env], env, probes, contacts_out)
+    poses: Poses,
+    terrain_of_env: wp.array[int],
+    terrain: Terrain,
+    probes: Probes,
+    ground: Ground,
+    parked: wp.array[int],
+    lanes: int,
+    contacts_out: Contacts,
+):
+    """Grid (num_bundles, num_envs, lanes): the threads of a warp look at the same part of different robots."""
+    bundle, env, lane = wp.tid()
+    if parked[env] == 2:
+        return
+    t = terrain_of_env[env]
+    column = poses.column_of_body[probes.bundle_body[bundle]]
+    wxyz = poses.xquat[env, column]
+    pose = wp.transform(poses.xpos[env, column], wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
+    ball = probes.bundle_ball[bundle]
+    middle = wp.transform_point(pose, wp.vec3(ball[0], ball[1], ball[2]))
+    lower = wp.vec2(middle[0] - ball[3], middle[1] - ball[3])
+    upper = wp.vec2(middle[0] + ball[3], middle[1] + ball[3])
+    if not (middle[2] - ball[3] < ceiling_over(terrain, t, lower, upper)):
+        return  # also where the state is NaN
+    for strip in range(probes.bundle_start[bundle], probes.bundle_start[bundle + 1]):
+        _collide_strip(pose, strip, lane, lanes, terrain, ground, t, env, probes, contacts_out)
 
 
 def collide_strips(
-    poses: Poses, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, parked: Any, near: NearStrips,
-    contacts: Contacts,
-) -> None:  # fmt: skip
-    """Find every robot's ``near`` strips, and its terrain contacts, all of ``contacts`` but the forces.
+    poses: Poses, terrain_of_env: Any, terrain: Terrain, probes: Probes, ground: Ground, parked: Any, contacts: Contacts
+) -> None:
+    """Find every robot's terrain contacts, all of ``contacts`` but the forces.
 
     Without arrays the ground is the same everywhere. Where ``parked`` (num_envs,) is 2 a robot touches nothing.
     """
-    near.count.zero_()
     contacts.count.zero_()
-    device, num_envs = terrain_of_env.device, len(terrain_of_env)
-    where = [poses, terrain_of_env, terrain, probes]
-    size = len(probes.bundle_start) - 1, num_envs
-    launch_grid(_find_near_strips_kernel, size, [*where, parked, near], device)
-    groups, lanes = (1, 1) if device.is_cpu else (_GROUPS, _LANES)
-    inputs = [*where, ground, near, groups, lanes, contacts]
-    launch_grid(_collide_strips_kernel, (num_envs, groups, lanes), inputs, device)
-
-
-def make_near_strips(num_envs: int, probes: Probes) -> NearStrips:
-    """Room for all strips of each robot, on the current device."""
-    return make_zeros(NearStrips, None, count=num_envs, strip=(num_envs, len(probes.strip_body)))
+    device, lanes, size = terrain_of_env.device, 1, (len(probes.bundle_body), len(terrain_of_env))
+    while not device.is_cpu and lanes < 16 and 2 * lanes * math.prod(size) <= _MAX_THREADS:
+        lanes *= 2
+    inputs = [poses, terrain_of_env, terrain, probes, ground, parked, lanes, contacts]
+    launch_grid(_collide_strips_kernel, (*size, lanes), inputs, device)
 
 
 def make_contacts(num_envs: int, capacity: int) -> Contacts:

@@ -15,7 +15,7 @@ import warp as wp
 from kernels.actuator_net import make_torques
 from kernels.conditions import BASE as BASE_BODY
 from kernels.conditions import Disturbed, DisturbedStep, ForcedStep, make_begin, make_disturb, make_robot_stage
-from kernels.contact import Poses, collide_strips, make_contacts, make_near_strips, sum_forces
+from kernels.contact import Poses, collide_strips, make_contacts, sum_forces
 from kernels.coordinates import Delay, SolverState, from_solver, limit_torques, to_solver
 from kernels.episode import Episodes, Outcome
 from kernels.ground import Ground
@@ -204,7 +204,6 @@ class Simulation:
         self.geom_of_shape = geoms[1 : 1 + builder.shape_count]
         self.probes = make_probes(builder)
         self.contacts = make_contacts(self.num_envs, self.robot.nconmax)
-        self._near_strips = make_near_strips(self.num_envs, self.probes)
         self.parked = wp.zeros(self.num_envs, dtype=int)
         # A mesh of several parts is several shapes of one name.
         robot = self.robot
@@ -359,8 +358,7 @@ class Simulation:
     def collide(self) -> None:
         """Find the terrain contacts of the present poses."""
         terrain, ground = self.bank.terrain, self.bank.ground or Ground()
-        found = self._near_strips, self.contacts
-        collide_strips(self.poses, self.terrain_of_env, terrain, self.probes, ground, self.parked, *found)
+        collide_strips(self.poses, self.terrain_of_env, terrain, self.probes, ground, self.parked, self.contacts)
 
     def physics_step(self, *, follows: bool = False) -> None:
         """Terrain contacts, then one solver step of ``robot.physics_dt``, in place.

@@ -18,7 +18,7 @@ from sim.device import host_device
 from sim.robots.robot import RobotCfg
 
 _DRAWS = 64  # of start poses
-_BUNDLE = 32  # strips at most, few enough that one thread looks where all of them lie
+_BUNDLE = 32  # strips at most, few enough that one thread looks at all where they are near the ground
 _vec3: Any = wp.vec3
 
 
@@ -230,8 +230,8 @@ def make_probes(builder: newton.ModelBuilder) -> Probes:
     probes.strip_radius = wp.array(radius, dtype=float)
     probes.strip_spread = wp.array([strip.spread for _, strip in strips], dtype=float)
     probes.strip_shape = wp.array(shape, dtype=int)
-    probes.strip_body = wp.array(body, dtype=int)
     probes.bundle_start = wp.array(bundles, dtype=int)
+    probes.bundle_body = wp.array([body[first] for first in bundles[:-1]], dtype=int)
     probes.bundle_ball = wp.array(balls, dtype=wp.vec4)
     return probes
 

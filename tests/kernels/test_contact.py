@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import kernels.contact
-from kernels.contact import Contacts, Poses, Probes, collide_strips, make_contacts, make_near_strips, sum_forces
+from kernels.contact import Contacts, Poses, Probes, collide_strips, make_contacts, sum_forces
 from kernels.ground import FIRM, PATCHES, Ground, make_ground
 from kernels.heightfield import SurfacePoint, Terrain, ceiling_over, nearest_surface_point
 from sim.mujoco_c.model import surface_heights
@@ -36,8 +36,7 @@ def make_probes(strips, spread=0.0, bundled=False):
     return filled(
         Probes, position=np.concatenate(centres), strip_start=np.cumsum([0, *map(len, centres)]),
         strip_radius=[radius for _, radius in strips], strip_spread=np.full(len(strips), spread), strip_shape=numbers,
-        strip_body=0 * numbers if bundled else numbers, bundle_start=np.cumsum([0, *map(len, bundles)]),
-        bundle_ball=balls,
+        bundle_start=np.cumsum([0, *map(len, bundles)]), bundle_body=numbers[: len(bundles)], bundle_ball=balls,
     )  # fmt: skip
 
 
@@ -56,9 +55,7 @@ def collide(poses, terrain_of_env, grids, strips, spread=0.0, ground=None, bundl
     xpos[:, columns], xquat[:, columns] = poses[..., :3], wxyz
     world, on = filled(Poses, xpos=xpos, xquat=xquat, column_of_body=columns), wp.array(terrain_of_env, dtype=int)
     parked, probes = wp.array(np.full(len(poses), parked), dtype=int), make_probes(strips, spread, bundled)
-    near = make_near_strips(len(poses), probes)
-    near.count.fill_(5)
-    collide_strips(world, on, make_terrain(grids), probes, ground or Ground(), parked, near, buffer)
+    collide_strips(world, on, make_terrain(grids), probes, ground or Ground(), parked, buffer)
     count = buffer.count.numpy()
     env, slot = np.nonzero(np.arange(buffer.shape.shape[1]) < count[:, None])
     names = [name for name in Contacts.vars if name not in ("count", "force")]
@@ -106,15 +103,14 @@ def test_how_many_threads_share_a_strip_changes_no_bit(device, monkeypatch):
         pytest.skip("a CPU has one thread for each")
     poses, row = sphere_poses(np.random.default_rng(8), BOXES, 100)[:, :1], np.linspace([0, 0, -0.2], [0, 0, 0.2], 9)
     found = []
-    for lanes in (kernels.contact._LANES, 16, 1):
-        monkeypatch.setattr(kernels.contact, "_LANES", lanes)
+    for most in (kernels.contact._MAX_THREADS, 0):  # 16 threads, and one
+        monkeypatch.setattr(kernels.contact, "_MAX_THREADS", most)
         records = collide(poses, np.zeros(100, int), BOXES[None], [(row, 0.04)])
         order = np.lexsort((records["rank"], records["env"]))
         found.append({name: records[name][order] for name in ("env", "rank", "point", "normal", "distance")})
     assert len(found[0]["env"]) > 40
     for name, values in found[0].items():
-        for others in found[1:]:
-            np.testing.assert_array_equal(values, others[name], err_msg=name)
+        np.testing.assert_array_equal(values, found[1][name], err_msg=name)
 
 
 def test_strips_report_first_deepest_and_last():

@@ -41,7 +41,7 @@ def gaps(sim, grids):
     probes = sim.probes
     poses = present(sim, "body_q")
     counts = np.diff(probes.strip_start.numpy())
-    body = np.repeat(probes.strip_body.numpy(), counts)
+    body = np.repeat(probes.bundle_body.numpy(), np.diff(probes.strip_start.numpy()[probes.bundle_start.numpy()]))
     radii = np.repeat(probes.strip_radius.numpy(), counts)
     gap = np.full(sim.num_envs, np.inf)
     for env, (pose, grid) in enumerate(zip(poses[:, body], grids, strict=True)):
