@@ -10,7 +10,7 @@ import warp as wp
 
 from kernels.launch import kernel_over
 
-BLOCK = 8
+BLOCK = 4
 """Cells along each side of a block of the ceiling grid."""
 
 _FAR = wp.constant(1.0e6)
@@ -142,26 +142,36 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
     col0 = int(wp.floor((p[0] - reach) / terrain.spacing))
     col1 = int(wp.floor((p[0] + reach) / terrain.spacing))
     nearest = wp.vec3(p[0], p[1], p[2] + _FAR)
+    least = float(_FAR)  # squared distance
     searched = bool(False)
     for row in range(row0, row1 + 1):
+        y = float(row) * terrain.spacing
+        across = wp.max(wp.max(y - p[1], p[1] - y - terrain.spacing), 0.0)
+        h10 = node_height(terrain, t, row, col0)
+        h11 = node_height(terrain, t, row + 1, col0)
         for col in range(col0, col1 + 1):
-            h00 = node_height(terrain, t, row, col)
+            h00 = h10
+            h01 = h11
             h10 = node_height(terrain, t, row, col + 1)
-            h01 = node_height(terrain, t, row + 1, col)
             h11 = node_height(terrain, t, row + 1, col + 1)
-            if p[2] - wp.max(wp.max(h00, h10), wp.max(h01, h11)) < reach:
+            above = p[2] - wp.max(wp.max(h00, h10), wp.max(h01, h11))
+            if above < reach:
                 searched = True
                 x = float(col) * terrain.spacing
-                y = float(row) * terrain.spacing
-                low_high = wp.vec3(x, y + terrain.spacing, h01)
-                high_low = wp.vec3(x + terrain.spacing, y, h10)
-                first = nearest_on_triangle(p, wp.vec3(x, y, h00), high_low, low_high)
-                high_high = wp.vec3(x + terrain.spacing, y + terrain.spacing, h11)
-                second = nearest_on_triangle(p, high_high, low_high, high_low)
-                if wp.length_sq(p - first) < wp.length_sq(p - nearest):
-                    nearest = first
-                if wp.length_sq(p - second) < wp.length_sq(p - nearest):
-                    nearest = second
+                along = wp.max(wp.max(x - p[0], p[0] - x - terrain.spacing), 0.0)
+                above = wp.max(above, 0.0)
+                if across * across + along * along + above * above <= least:  # else all of the cell is farther
+                    low_high = wp.vec3(x, y + terrain.spacing, h01)
+                    high_low = wp.vec3(x + terrain.spacing, y, h10)
+                    first = nearest_on_triangle(p, wp.vec3(x, y, h00), high_low, low_high)
+                    high_high = wp.vec3(x + terrain.spacing, y + terrain.spacing, h11)
+                    second = nearest_on_triangle(p, high_high, low_high, high_low)
+                    if wp.length_sq(p - first) < least:
+                        least = wp.length_sq(p - first)
+                        nearest = first
+                    if wp.length_sq(p - second) < least:
+                        least = wp.length_sq(p - second)
+                        nearest = second
     point = SurfacePoint()
     point.normal = wp.vec3(0.0, 0.0, 1.0)
     point.distance = _FAR
