@@ -16,14 +16,18 @@ ROOT = Path(__file__).parents[1]
 PAGES = {str(path.relative_to(ROOT)): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]}
 """The pages by name, such as ``docs/faults.md``."""
 _NUMBER = re.compile(r"(?<![\w.])(?:\d+(?:,\d{3})*(?:\.\d+)?|\.\d+)(?!\w)")
-_NO_PROSE = (r"^```.*?^```$", r"^\|.*?$", r"<!--.*?-->", r"`[^`\n]*`", r"\]\([^)\s]*\)", r"https?://\S+")
+_NO_PROSE = (
+    r"<!-- table:.*?<!-- end -->", r"<!--.*?-->", r"^```.*?^```$", r"`[^`\n]*`", r"\]\([^)\s]*\)", r"https?://\S+",
+)  # fmt: skip
+_LISTS = ("docs/controllers.md", "docs/reference.md", "docs/terrains.md")
+"""Pages whose tables say what files and genes hold: tests of their own compare what may change."""
 _FUNCTIONS = {"__builtins__": {}, "len": len, "max": max, "min": min, "round": round, "sum": sum}
 """What an expression may call."""
 _KINDS = (
     r"arXiv \d+\.\d+", r"Python 3\.\d+", "95 %", r"Apache-2\.0", r"exit status is \d+", r"seed \d",
-    r"\d GB of disk", "RTX 3070",
+    r"\d GB of disk", "RTX 3070", r"legged_gym's grid is 0\.1 m",
 )  # fmt: skip
-"""Numbers that no file has: of papers and versions, the level of all intervals, exit statuses."""
+"""Numbers that no file has: of others' papers and code, of versions, the level of all intervals, exit statuses."""
 
 
 def text_of(page: str) -> str:
@@ -35,6 +39,14 @@ def code_of(page: str, language: str = "") -> list[str]:
     """Code blocks of a page in a language; without one those of a shell."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text_of(page), re.MULTILINE | re.DOTALL)
     return [code for name, code in blocks if name == language]
+
+
+def table_of(*head: str) -> list[list[str]]:
+    """Cells of the rows of the only table of any page whose head begins with these columns."""
+    tables = [table for page in PAGES for table in re.findall(r"^((?:\|.*\n)+)", text_of(page), re.MULTILINE)]
+    rows = [[[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()] for table in tables]
+    (found,) = [body for first, _, *body in rows if first[: len(head)] == [*head]]
+    return found
 
 
 def commands_of(page: str) -> list[str]:
@@ -59,9 +71,9 @@ def run_by_make(words: Sequence[str]) -> list[str]:
 
 
 def prose_of(page: str) -> str:
-    """A page without code, tables, comments and the targets of links, each white space as one blank."""
+    """A page without code, tables that scripts write, comments and targets of links, each white space as one blank."""
     text = text_of(page)
-    for pattern in _NO_PROSE:
+    for pattern in (*_NO_PROSE, *[r"^\|.*?$"] * (page in _LISTS)):
         text = re.sub(pattern, " ", text, flags=re.MULTILINE | re.DOTALL)
     return re.sub(r"\s+", " ", text)
 

@@ -12,12 +12,16 @@ import torch
 import tyro
 
 import faultline
+from kernels.course import SPACING
 from qd.search import loop
 from qd.workers import crosser
 from sim.controllers.described import TERMS, Described, read_controller
 from sim.controllers.loaders import load_policy
 from sim.robots.compiled import robot_spec
 from sim.robots.find import get_robot
+from sim.terrains.conditions.kinds import CONDITIONS
+from sim.terrains.elements.kinds import ELEMENTS
+from sim.terrains.spaces.course import Course
 from tests import docs as pages
 from tests.docs import PAGES, ROOT, code_of, text_of
 from tests.qd.stand_in import open_stand_in
@@ -57,6 +61,32 @@ def test_numbers_of_prose_are_those_of_their_sources(page):
     assert pages.unknown_numbers(page) == []
     for row in (row for row in pages.numbers() if row.page == page or row.text in pages.prose_of(page)):
         assert row.text in pages.prose_of(page) and row.is_rounded(row.value), f"{row.text}: {row.value:.6g}"
+
+
+def test_the_elements_of_the_page_are_those_of_courses():
+    rows, kinds = pages.table_of("element", "genes: size"), [ELEMENTS[name] for name in Course().kinds]
+    for (name, *words, _, _), kind in zip(rows, kinds, strict=True):
+        slopes, lengths = (re.findall(rf"{mark}(\d[\d.]*)", " ".join(words)) for mark in ("1:", r"(?<![\d.:])(?!1:)"))
+        said = {1.0 / float(number) for number in slopes} | set(map(float, lengths))
+        # Whole numbers are of cells, or of steps and pallets. A turn is a direction, or a shift by so many cells.
+        ends = [{end, SPACING * end} for about in kind.ranges for end in about[:2]]
+        assert all(any(np.isclose(number, [*end]).any() for end in ends) for number in said), (name, said, ends)
+        for end in ends[:-2]:
+            assert 0 in end or any(np.isclose(number, [*end]).any() for number in said), (name, said, end)
+
+
+def test_the_conditions_of_the_page_are_those_of_spaces():
+    shipped = {name: kind for name, kind in CONDITIONS.items() if type(kind).__module__.startswith("sim.")}
+    order, kinds, known = [*shipped], [], {name: set() for name in shipped}
+    for names, _, *numbers in pages.table_of("", "what it does", "gene of -1", "nominal"):
+        if named := re.findall(r"`(\w+)`", names):
+            kinds = order[order.index(named[0]) : order.index(named[-1]) + 1]
+        for kind in kinds:
+            known[kind].add(tuple(float(number.split()[0]) if number else None for number in numbers))
+    for name, kind in shipped.items():
+        ends = {(gene.low, gene.high): round(float(gene.to_value(gene.absent)), 9) for gene in kind.genes}
+        assert {(low, high) for low, _, high in known[name]} == {*ends}, name
+        assert all(nominal in (None, ends[low, high]) for low, nominal, high in known[name]), name  # None: none is
 
 
 def test_the_robots_of_the_page_are_read(tmp_path):

@@ -5,7 +5,7 @@ import itertools
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ MAX_GIF_BYTES = 2_000_000
 _COLORS = (256, 128, 96, 64, 48, 32, 16)  # of a GIF; fewer where it would be too large
 _SUPERSAMPLING = 2  # of a GIF's pictures
 _SLOW_S = 1.0  # before the moment of failure
+_QUICKNESS = 4.0  # of what is left of a ghost's way
 _DISTANCE = 2.5  # of the camera, in heights or lengths of the robot
 _SMOOTH_S = 0.8  # over which the camera follows the base
 _ELEVATIONS = (-22.0, -32.0, -45.0, -60.0)
@@ -71,19 +72,32 @@ class Shot:
         outcome = self.recording.outcome[0, self.episode]
         return None if outcome == Outcome.GOAL else find_failure_time(self.recording, self.episode)
 
+    @property
+    def arrival(self) -> float | None:
+        """When the ghost arrives, if there is one that does [s]."""
+        if self.beside is None or self.beside[1].outcome[0, self.episode] != Outcome.GOAL:
+            return None
+        return replace(self, recording=self.beside[1], beside=None).end
+
     def times(
         self, fps: float, *, whole: bool = False, before_s: float = 3.0, after_s: float = 1.0, slowness: float = 4.0
     ) -> NDArray[np.float64]:
         """Time of each picture [s]: from before the robot fails to after it, the second before it slower.
 
-        The whole of the episode, or one in which the robot arrives, is shown to ``after_s`` after its end.
+        The whole of the episode, or one in which the robot arrives, is shown to ``after_s`` after its end. A ghost that
+        arrives later is shown to ``after_s`` after that, the rest of its way quickly.
         """
         moment = self.end if self.moment is None else self.moment
         whole = whole or self.moment is None
         begin, stop = (0.0, self.end + after_s) if whole else (max(0.0, moment - before_s), moment + after_s)
         slow = moment if self.moment is None else max(begin, moment - _SLOW_S)
-        played = np.cumsum([0.0, slow - begin, slowness * (moment - slow), stop - moment])
-        return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / fps), played, [begin, slow, moment, stop])
+        arrival = max(stop, self.arrival or 0.0)
+        last_s = after_s if arrival > stop else 0.0
+        played = np.cumsum(
+            [0.0, slow - begin, slowness * (moment - slow), stop - moment, (arrival - stop) / _QUICKNESS, last_s]
+        )
+        ends = [begin, slow, moment, stop, arrival, arrival + last_s]
+        return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / fps), played, ends)
 
 
 def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
@@ -97,9 +111,14 @@ def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.fl
 
 
 def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Camera]:
-    """A camera a time, ``distance`` [m] from the base: it follows smoothly, as low as the ground never hides it."""
+    """A camera a time, ``distance`` [m] from the base: it follows smoothly, as low as the ground never hides it.
+
+    Behind the end of the episode it follows a ghost that arrives later.
+    """
     recording = shot.recording
     base = recording.qpos(0, shot.episode)[:, :3]
+    if shot.beside is not None and (shot.arrival or 0.0) > shot.end:
+        base = np.concatenate([base, shot.beside[1].qpos(0, shot.episode)[len(base) :, :3]])
     smooth = uniform_filter1d(base, max(1, round(_SMOOTH_S / recording.dt)) | 1, axis=0, mode="nearest")
     targets = np.stack([np.interp(times, recording.dt * np.arange(len(base)), axis) for axis in smooth.T], axis=1)
     elevation = clear_elevation(recording.heights[0], targets, distance)
@@ -144,8 +163,7 @@ def render_pictures(
         draw.line(_locate(chart, path), get_ending(recording, k).color if shown else "white", 1 + 2 * shown)
     if goal := places(asked_of(recording.ground)).get("goal"):
         draw.circle(_locate(chart, np.array([goal]))[0], side / 60, "#009e73", "white")
-    steps = np.diff(times, append=np.inf)
-    slowness = np.rint(np.diff(times).max(initial=0.0) / np.maximum(steps, 1e-9)).astype(int).tolist()
+    speeds = (np.diff(times, append=np.inf) * (FPS if size[0] > GIF_SIZE[0] else GIF_FPS)).tolist()
     width, height = (pixels * (1 if size[0] > GIF_SIZE[0] else _SUPERSAMPLING) for pixels in size)
     look: Any = {"width": width, "height": height, "shadows": shadows, "ground": recording.ground}
     with Renderer(robot, recording.heights[0], **look) as renderer:
@@ -157,7 +175,7 @@ def render_pictures(
             beside = None if ghost_poses is None else interpolate_pose(ghost_poses, time_s / recording.dt)
             pixels = renderer.render(pose, camera, ghost=beside, ghost_name=ghost_name, **touch)
             picture = Image.fromarray(pixels).resize(size, Image.Resampling.BOX)
-            _write_captions(picture, shot, time_s, slowness[number])
+            _write_captions(picture, shot, time_s, speeds[number])
             inset = chart.copy()
             ImageDraw.Draw(inset).circle(_locate(chart, pose[None, :2])[0], chart.width / 40, "white", "black")
             picture.paste(inset, (size[0] - chart.width, 0))
@@ -166,7 +184,7 @@ def render_pictures(
                 progress((number + 1) / len(times))
 
 
-def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: int) -> None:
+def _write_captions(picture: Image.Image, shot: Shot, time_s: float, speed: float) -> None:
     """Writes the title at the top, the time at the bottom, and from the moment of failure on how the robot fails."""
     unit = picture.height / 540
     draw = ImageDraw.Draw(picture)
@@ -183,8 +201,9 @@ def _write_captions(picture: Image.Image, shot: Shot, time_s: float, slowness: i
         write(10, 62, f"{success}: {count_rates(shot.recording)['goal_rate']}", 24, "#303030")
     else:
         write(10, 62, f"{shot.beside[0]} {make_title(shot.beside[1]).partition(': ')[2]}", 24, "#0b6e62")
-    speed = f"  1/{slowness} speed" if slowness > 1 else ""
-    write(picture.width / unit - 10, 528, f"{min(time_s, shot.end):.1f} s{speed}", 24, "black", "rs")
+    words = f"  1/{1.0 / speed:.0f} speed" if speed < 0.7 else f"  {speed:.0f} x speed" if 1.4 < speed < np.inf else ""
+    time_s = min(time_s, max(shot.end, shot.arrival or 0.0))
+    write(picture.width / unit - 10, 528, f"{time_s:.1f} s{words}", 24, "black", "rs")
     if shot.moment is not None and time_s >= shot.moment:
         recording, row = shot.recording, (0, shot.episode)
         failure = way_to_end(recording.outcome[row], asked_of(recording.ground), fallen=bool(recording.fallen[row]))

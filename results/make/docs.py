@@ -2,9 +2,10 @@
 
 A table stands between the lines `<!-- table: NAME -->` and `<!-- end -->`. NAME is a function of TABLES, with a robot
 behind it if the function takes one. With --check nothing is written: the exit status is 1 if a page says something
-else than the files.
+else than the files, or if a picture shows another state of them.
 """
 
+import hashlib
 import json
 import re
 import sys
@@ -21,6 +22,8 @@ from sim.files.intervals import format_value
 
 ROOT = Path(__file__).parents[2]
 PICTURES = ROOT / "docs/pictures"
+MADE = "docs/pictures/made.json"
+"""What each picture shows: files with their hashes, or ``FILE#KEY/KEY`` for a part of a JSON file."""
 ROBOTS = {"anymal": "ANYmal C", "cassie": "Cassie"}
 CONTROLLERS = ("base", "C-HC", "C-HR", "C-G", "hardened")
 NONE = "-"
@@ -688,10 +691,37 @@ def with_tables(text: str) -> str:
     return MARKED.sub(make, text)
 
 
+def note_picture(name: str, *sources: str) -> None:
+    """Keeps of which files a picture of docs/pictures was made just now."""
+    made = read(MADE) | {name: {source: _hash(source) for source in sources}}
+    (ROOT / MADE).write_text(json.dumps(dict(sorted(made.items())), indent=1) + "\n", encoding="utf-8")
+
+
+def find_old_pictures() -> dict[str, str]:
+    """Pictures that show another state of a file than today's, each with the file; or nobody knows what they show."""
+    made = read(MADE)
+    names = [file.name for file in sorted((ROOT / MADE).parent.glob("*")) if file.suffix in (".gif", ".jpg", ".png")]
+    old = {name: source for name in names for source, known in made.get(name, {}).items() if _hash(source) != known}
+    return old | {name: MADE for name in names if name not in made}
+
+
+def _hash(source: str) -> str:
+    file, _, keys = source.partition("#")
+    if not keys:
+        return hashlib.sha256((ROOT / file).read_bytes()).hexdigest()
+    part = read(file)
+    for key in keys.split("/"):
+        part = part.get(key, {})
+    return hashlib.sha256(json.dumps(part, sort_keys=True).encode()).hexdigest()
+
+
 def main(argv: Sequence[str]) -> int:
     """Writes or checks all pages; returns the exit status."""
     check = "--check" in argv
     status = 0
+    for name, source in find_old_pictures().items() if check else ():
+        status = 1
+        print(f"{name} shows another {source}")
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
         text = page.read_text(encoding="utf-8")
         if (updated := with_tables(text)) != text:

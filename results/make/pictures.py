@@ -31,7 +31,7 @@ from qd.show.figures import draw_archive, save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
 from qd.show.replay import ReplaySource, save, source_from_map, source_from_run
 from results.make.common import runs_of_today
-from results.make.docs import PAPER, ROBOTS, least_minimum, read
+from results.make.docs import PAPER, PICTURES, ROBOTS, least_minimum, note_picture, read
 from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
 from sim.rates import typical_outcome
@@ -41,7 +41,6 @@ from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.elements.kinds import ELEMENTS
 from sim.terrains.spaces.course import Course
 
-FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 STILL_SIZE = (640, 360)
 """Width and height [pixels]."""
 CLIPS = (("anymal", "trench.npz", "a trench before stairs", None), ("cassie", "hole.npz", "a hole", "C-G"))
@@ -54,6 +53,13 @@ FILMED = {
     "segment_1": ("anymal", "route"),
 }
 """Conditions of which the smallest example of a robot's search is filmed."""
+GROWN = {
+    "archive": ("default", "C0"),
+    "independent": ("default, two other seeds", "C9"),
+    "third": (None, "C9"),
+    "archive_cma_mae": ("CMA-MAE", "C1"),
+}
+"""Published searches whose growth is drawn, with label and colour."""
 FILM_SIZE, FILM_BYTES = (400, 225), 300_000
 """Width and height of a small film [pixels], and its largest file."""
 
@@ -61,7 +67,7 @@ FILM_SIZE, FILM_BYTES = (400, 225), 300_000
 def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]:
     """Four seconds about the failure of a robot's typical episode: 1.5 s, one at half speed, and half a second."""
     robot = get_robot(named)
-    source = source_from_map(FOLDER / file, robot)
+    source = source_from_map(PICTURES / file, robot)
     (recording,) = source.record("cpu")
     other = (beside, source.record("cpu", source.requests(controllers_in(robot.panel)[beside]))[0]) if beside else None
     episode, title = find_typical_episode(recording, source.scales), make_title(replace(recording, labels=(words,)))
@@ -76,11 +82,12 @@ def take_still(source: ReplaySource, name: str) -> None:
     shot = Shot(recording=recording, episode=episode, title=make_title(recording))
     moment = shot.end if shot.moment is None else shot.moment
     (picture,) = render_pictures(shot, source.robot, np.array([moment]), STILL_SIZE)
-    Image.fromarray(picture).save(FOLDER / f"{name}.jpg", quality=85)
+    Image.fromarray(picture).save(PICTURES / f"{name}.jpg", quality=85)
+    note_picture(f"{name}.jpg", "results/anymal/spaces.json#spaces/course")
 
 
-def film_failure(source: ReplaySource, name: str, words: str) -> None:
-    """A small film of the commonest failure on a terrain; none where robots do not fail today."""
+def film_failure(source: ReplaySource, name: str, words: str, *made_of: str) -> None:
+    """A small film of the commonest failure on a terrain, made of these files; none where robots do not fail today."""
     (recording,) = source.record("cpu")
     stopped = [outcome for outcome in recording.outcome[0] if outcome not in (Outcome.GOAL, Outcome.INVALID)]
     if not stopped:
@@ -88,15 +95,17 @@ def film_failure(source: ReplaySource, name: str, words: str) -> None:
     episode = find_typical_episode(recording, source.scales, int(typical_outcome(np.array(stopped))))
     shot = Shot(recording=recording, episode=episode, title=make_title(replace(recording, labels=(words,))))
     pictures = render_pictures(shot, source.robot, shot.times(GIF_FPS, before_s=1.5, after_s=0.5), FILM_SIZE)
-    save(FOLDER / f"{name}.gif", as_gif([*pictures], FILM_BYTES), "Film")
+    save(PICTURES / f"{name}.gif", as_gif([*pictures], FILM_BYTES), "Film")
+    note_picture(f"{name}.gif", *made_of)
 
 
 def film_conditions() -> None:
     """Films of the smallest examples of the published searches under conditions."""
     for kind, (robot, search) in FILMED.items():
         if (least := least_minimum(robot, kind, search)) is not None:
-            source = source_from_run(open_run(robot, Path(f"results/{robot}/{search}")), minimal=str(least["elite"]))
-            film_failure(source, kind, CONDITIONS[kind].cause)
+            run = f"results/{robot}/{search}"
+            source = source_from_run(open_run(robot, Path(run)), minimal=str(least["elite"]))
+            film_failure(source, kind, CONDITIONS[kind].cause, f"{run}/minimal.npz", f"sim/robots/{robot}.pt")
 
 
 def course_source() -> ReplaySource | None:
@@ -129,9 +138,7 @@ def draw_growth() -> Figure:
     figure = new_figure(12, 3.6)
     for axes, (robot, words) in zip(figure.subplots(1, len(ROBOTS)), ROBOTS.items(), strict=True):
         axes.set(title=words, xlabel="million episodes", ylabel="elites")
-        searches = {"archive": ("default", "C0"), "independent": ("default, two other seeds", "C9")}
-        searches |= {"third": (None, "C9"), "archive_cma_mae": ("CMA-MAE", "C1")}
-        for name, (of_search, color) in searches.items():
+        for name, (of_search, color) in GROWN.items():
             rows = read(f"results/{robot}/{name}/curve.json")["curve"]
             for count, style in {"corrected_elites": "-", "failing": "--"}.items():
                 episodes, counts = [row["episodes"] / 1e6 for row in rows], [row[count] for row in rows]
@@ -157,15 +164,16 @@ def draw_elements() -> Figure:
     figure = new_figure(12, 7.2)
     y, x = (SPACING * np.arange(size) for size in heights.shape[1:])
     shown = np.ix_((y >= 3.0) & (y <= 5.0), (x >= 3.6) & (x <= 7.6))
+    lowest, highest = heights.min(), heights.max()
     light, limits = LightSource(azdeg=315, altdeg=35), Normalize(-0.8, 0.8)
     for number, (row, grid) in enumerate(zip(genes, heights, strict=True), 1):
         axes: Any = figure.add_subplot(3, -(-len(genes) // 3), number, projection="3d")
         part, (across, along) = grid[shown], np.meshgrid(y[shown[0].ravel()], x[shown[1].ravel()], indexing="ij")
         colours = light.shade(part, colormaps["cividis"], norm=limits, dx=SPACING, dy=SPACING, blend_mode="soft")
         axes.plot_surface(along, across, part, facecolors=colours, rstride=1, cstride=1, lw=0, antialiased=False)
-        axes.set(zlim=(-0.8, 0.8))
-        axes.set_title(textwrap.fill(course.describe(row), 36), fontsize=9, y=1.06)
-        axes.set_box_aspect((np.ptp(along), np.ptp(across), 1.6), zoom=1.25)
+        axes.set(zlim=(lowest, highest))
+        axes.set_title(textwrap.fill(course.describe(row), 36), fontsize=9, y=1.0)
+        axes.set_box_aspect((np.ptp(along), np.ptp(across), highest - lowest), zoom=1.15)
         axes.view_init(elev=28, azim=-125)
         axes.set_axis_off()
     return figure
@@ -197,23 +205,33 @@ def draw_loop() -> Figure:
     return figure
 
 
+def draw(name: str, figure: Figure, *made_of: str) -> None:
+    """Writes a figure, made of these files."""
+    save_figure(PICTURES / name, figure)
+    note_picture(name, *made_of)
+
+
 def main() -> None:
     """Makes the pictures that the command line names, all without any."""
     wanted = sys.argv[1:] or ["film", "conditions", "stills", "pages", "curves", "drawings"]
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
-        save(FOLDER / "fault.gif", as_gif(pictures), "Film")
+        save(PICTURES / "fault.gif", as_gif(pictures), "Film")
+        made_of = [f"docs/pictures/{file}" for _, file, *_ in CLIPS] + [f"sim/robots/{robot}.pt" for robot in ROBOTS]
+        note_picture("fault.gif", *made_of, *(f"results/{robot}/{name}.pt" for robot, *_, name in CLIPS if name))
     if "conditions" in wanted:
         film_conditions()
     if "stills" in wanted and (course := course_source()) is not None:
         take_still(course, "course")
     if "drawings" in wanted:
-        save_figure(FOLDER / "elements.png", draw_elements())
-        save_figure(FOLDER / "loop.png", draw_loop())
+        draw("elements.png", draw_elements())
+        draw("loop.png", draw_loop())
     if "curves" in wanted:
-        save_figure(FOLDER / "noise.png", draw_noise())
-        save_figure(FOLDER / "growth.png", draw_growth())
-        save_figure(FOLDER / "axes.png", draw_archive(read_archive(Path("results/cassie/archive_cma_mae"))))
+        draw("noise.png", draw_noise(), *(f"results/{robot}/search_noise.json" for robot in ROBOTS))
+        curves = [f"results/{robot}/{name}/curve.json" for robot in ROBOTS for name in GROWN]
+        draw("growth.png", draw_growth(), *curves)
+        archive = "results/cassie/archive_cma_mae"
+        draw("axes.png", draw_archive(read_archive(Path(archive))), f"{archive}/archive.npz")
     if "pages" in wanted:
         subprocess.run([sys.executable, "-m", "tests.qd.show.view.browser"], check=True)
 

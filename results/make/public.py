@@ -204,7 +204,7 @@ def draw_film(name: str, runs: Path) -> None:
     if opened.minima is None:
         return
     source = source_from_run(opened, minimal=str(opened.minima.numbers["elites"][0]["elite"]))
-    film_failure(source, name, f"{name}, a minimal terrain")
+    film_failure(source, name, f"{name}, a minimal terrain", f"results/public.json#controllers/{name}/archive")
 
 
 def main(argv: Sequence[str] | None = None) -> dict[str, Any]:

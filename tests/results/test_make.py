@@ -258,6 +258,27 @@ def test_pages_say_what_the_files_say():
     assert docs.main(["--check"]) == 0
 
 
+def test_a_picture_is_old_once_what_it_shows_is_another(tmp_path, monkeypatch):
+    monkeypatch.setattr(docs, "ROOT", tmp_path)
+    (tmp_path / "docs/pictures").mkdir(parents=True)
+    assert docs.find_old_pictures() == {}
+    numbers, archive = tmp_path / "numbers.json", tmp_path / "archive.npz"
+    numbers.write_text('{"dogs": {"a": 1, "b": 2}}')
+    archive.write_bytes(b"elites")
+    for name in ("a.gif", "plain.png", "unknown.jpg"):
+        (tmp_path / "docs/pictures" / name).touch()
+    docs.note_picture("a.gif", "archive.npz", "numbers.json#dogs/a")
+    docs.note_picture("plain.png")
+    assert docs.find_old_pictures() == {"unknown.jpg": docs.MADE}
+    numbers.write_text('{"dogs": {"a": 1, "b": 3}}')
+    assert "a.gif" not in docs.find_old_pictures()
+    numbers.write_text('{"dogs": {"a": 4, "b": 3}}')
+    assert docs.find_old_pictures()["a.gif"] == "numbers.json#dogs/a"
+    archive.write_bytes(b"others")
+    docs.note_picture("a.gif", "numbers.json#dogs/a")
+    assert "a.gif" not in docs.find_old_pictures()
+
+
 def test_a_table_is_written_between_its_marks(tmp_path, monkeypatch):
     (tmp_path / "docs").mkdir()
     (tmp_path / "README.md").write_text("Before.\n<!-- table: spaces -->\nold\n<!-- end -->\nBehind.\n")

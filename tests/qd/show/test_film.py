@@ -86,6 +86,15 @@ def test_a_film_begins_three_seconds_before_the_failure_slows_down_and_ends_one_
     np.testing.assert_allclose(arrives, np.arange(61) / 10)  # all of it, at its speed
     short = replace(recording, num_frames=np.full((1, 5), 26, np.int32))
     np.testing.assert_allclose(Shot(recording=short, episode=4).times(10)[[0, 20, 30]], [0.0, 0.5, 1.5])
+    # A ghost that arrives at 5 s, after a failure at 0.5 s: from 1.5 s on in 0.875 s, and 1 s more.
+    beside = "C-G", replace(recording, outcome=np.full((1, 5), Outcome.GOAL, np.uint8))
+    shot = Shot(recording=short, episode=4, beside=beside)
+    assert shot.arrival == pytest.approx(5.0)
+    np.testing.assert_allclose(shot.times(8)[[0, 16, 24, 31, 39]], [0.0, 0.5, 1.5, 5.0, 6.0])
+    stuck = "C-G", recording
+    assert Shot(recording=short, episode=4, beside=stuck).times(8)[-1] == pytest.approx(1.5)
+    later = [camera.target[0] for camera in follow(shot, np.array([0.4, 5.0]), 3.0)]
+    np.testing.assert_allclose(later[1] - later[0], np.ptp(recording.qpos(0, 4)[[20, 250], 0]), rtol=0.1)
 
 
 def test_poses_lie_between_those_recorded():

@@ -1,10 +1,9 @@
 """The viewer as a user begins it, a tab without a browser, and chromium without a screen driven by playwright.
 
-``python -m tests.qd.show.view.browser [--report PAGE]`` takes pictures of the viewer, with the published archive of
-ANYmal, and of the report's top.
+``python -m tests.qd.show.view.browser`` takes pictures of the viewer, with the published archive of ANYmal, and of the
+top of its report.
 """
 
-import argparse
 import io
 import shutil
 import signal
@@ -23,10 +22,10 @@ import viser
 from PIL import Image
 from websockets.sync.client import ClientConnection, connect
 
+from results.make.docs import PICTURES, note_picture
 from tests.builders import free_port
 
 ROOT = Path(__file__).parents[4]
-DOCS = ROOT / "docs" / "pictures"
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 LIMIT_MS = 120_000
 """From a click to what it shows, on a busy machine that draws without a GPU."""
@@ -106,22 +105,24 @@ def take(page, file: Path) -> None:
 
 def main() -> None:
     """Takes all pictures."""
-    flags = argparse.ArgumentParser(description=__doc__)
-    flags.add_argument("--report", type=Path, help="a page that `faultline report` wrote")
-    report = flags.parse_args().report
+    run, shown = "results/anymal/archive", "results/anymal/archive/archive.npz"
+    report = ROOT / "runs/pictures/report.html"
+    command = [sys.executable, "-m", "faultline", "report", "--run", run, "--out", str(report)]
+    subprocess.run(command, cwd=ROOT, check=True)
     with open_chromium() as browser:
-        with serve("--run", "results/anymal/archive") as address:
+        with serve("--run", run) as address:
             page = browser.new_page(viewport={"width": 1366, "height": 768})
             page.goto(address, timeout=LIMIT_MS)
             wait_for(page, PLAYS)
             wait_for(page, "/Ghost, .* after/.test(document.querySelector('#faultline .words').textContent)")
             page.get_by_title("end: ").locator("span").click(timeout=LIMIT_MS)
             page.keyboard.press("Space")
-            take(page, DOCS / "viewer.jpg")
-        if report is not None:
-            page = browser.new_page(viewport={"width": 1400, "height": 1400})
-            page.goto(report.absolute().as_uri())
-            take(page, DOCS / "report.jpg")
+            take(page, PICTURES / "viewer.jpg")
+            note_picture("viewer.jpg", shown)
+        page = browser.new_page(viewport={"width": 1400, "height": 1400})
+        page.goto(report.as_uri())
+        take(page, PICTURES / "report.jpg")
+        note_picture("report.jpg", shown)
 
 
 if __name__ == "__main__":
