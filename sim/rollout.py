@@ -39,9 +39,7 @@ from sim.terrains.spaces.registry import check_conditions, space_key
 from sim.terrains.spaces.super_gaussian import SUPER_GAUSSIAN
 from sim.terrains.terrains import Terrains
 
-_LOOKS_AHEAD = (
-    2  # at what has ended: steps that a GPU has to make while its host asks for terrains (0.3 s of 22,400 robots)
-)
+_LOOKS_AHEAD = 2  # at what has ended: what a GPU has to do while its host asks for terrains, 0.3 s of 22,400 robots
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,8 +3,9 @@
 ``film`` makes docs/pictures/fault.gif from terrains that are kept beside it, so that new archives do not change it; the
 robots' controllers of the day cross them. ``conditions`` films minimal examples of the published searches under
 conditions, and ``stills`` shows the worst course where its search is here (results.make.spaces).
-``pages`` takes the pictures of the viewer and of the report. ``curves`` draws what the published files say of searches,
-``drawings`` the elements of a course and the loop of a search.
+``training`` films ANYmal before and after its hardening. ``pages`` takes the pictures of the viewer and of the report.
+``curves`` draws what the published files say of searches, ``drawings`` the elements of a course, the loop of a search,
+the probes of a robot and the terrains of its pack.
 """
 
 import itertools
@@ -19,13 +20,16 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from kernels.course import GENES_PER_ELEMENT, SPACING
 from kernels.episode import Outcome
+from qd.evaluate.pack import find_pack, read_pack
 from qd.faults.searches import controllers_in
 from qd.search.archive import read_archive
-from qd.show.crossed import find_typical_episode, make_title
+from qd.show.crossed import count_rates, find_typical_episode, make_title
 from qd.show.elites import open_run
 from qd.show.figures import draw_archive, save_figure
 from qd.show.film import GIF_FPS, Picture, Shot, as_gif, render_pictures
@@ -36,10 +40,13 @@ from results.make.search_noise import DESIGNS
 from sim.files.figures import new_figure
 from sim.rates import typical_outcome
 from sim.robots.find import get_robot
+from sim.rollout import Rollout
 from sim.terrains.bank import make_heights
 from sim.terrains.conditions.kinds import CONDITIONS
 from sim.terrains.elements.kinds import ELEMENTS
+from sim.terrains.maps.picture import height_colors
 from sim.terrains.spaces.course import Course
+from sim.terrains.terrains import Terrains
 
 STILL_SIZE = (640, 360)
 """Width and height [pixels]."""
@@ -106,6 +113,23 @@ def film_conditions() -> None:
             run = f"results/{robot}/{search}"
             source = source_from_run(open_run(robot, Path(run)), minimal=str(least["elite"]))
             film_failure(source, kind, CONDITIONS[kind].cause, f"{run}/minimal.npz", f"sim/robots/{robot}.pt")
+
+
+def film_training() -> None:
+    """Of a search that no training saw, the worst elite that always stops ANYmal and never the hardened one."""
+    run, hardened = "results/anymal/independent", "results/anymal/hardened.pt"
+    opened = open_run("anymal", Path(run))
+    for number in opened.rank().worst(len(opened.archive)):
+        source = source_from_run(opened, str(number))
+        (before,), (after,) = source.record("cpu"), source.record("cpu", source.requests(hardened))
+        rates = [count_rates(recording)["goal_rate"] for recording in (before, after)]
+        episode = find_typical_episode(before, source.scales)
+        if rates[0].hits == 0 and rates[1].hits == rates[1].count:
+            shot = Shot(recording=before, episode=episode, title=make_title(before), beside=("hardened", after))
+            times = shot.times(GIF_FPS, before_s=1.5, after_s=0.5, slowness=2.0)
+            save(PICTURES / "hardened.gif", as_gif([*render_pictures(shot, opened.robot, times)], 1_000_000), "Film")
+            note_picture("hardened.gif", f"{run}/archive.npz", hardened, "sim/robots/anymal.pt")
+            return
 
 
 def course_source() -> ReplaySource | None:
@@ -179,6 +203,51 @@ def draw_elements() -> Figure:
     return figure
 
 
+def draw_probes() -> Figure:
+    """ANYmal from the side on rubble: its probes, those that touch, and the ground under the way."""
+    robot, course = get_robot("anymal"), Course()
+    genes = np.full((6, GENES_PER_ELEMENT), -1.0, np.float32)
+    genes[0, :2] = (2 * [*course.kinds].index("rubble") + 1) / len(course.kinds) - 1.0, 0.0
+    genes[0, 2:] = 1.0
+    terrains = Terrains(genes=genes.reshape(1, -1), seeds=np.zeros(1, np.uint32), space=course)
+    rollout = Rollout(robot, str(robot.policy_file), num_terrains=1, replicas=1, device="cpu", space=course)
+    rollout.put(terrains)
+    sim = rollout.sim
+    while sim.joint_q.numpy()[0, 0] < 6.5:
+        rollout.control_step()
+    sim.collide()
+    probes, poses, bodies = sim.probes, sim.poses, sim.poses.column_of_body.numpy()
+    strips = np.diff(probes.strip_start.numpy())
+    column = bodies[np.repeat(probes.bundle_body.numpy(), np.diff(probes.bundle_start.numpy()))].repeat(strips)
+    turns = Rotation.from_quat(poses.xquat.numpy()[0, column], scalar_first=True)
+    centres = poses.xpos.numpy()[0, column] + turns.apply(probes.position.numpy())
+    figure = new_figure(9, 3.6)
+    axes = figure.subplots()
+    for (x, _, z), radius in zip(centres, probes.strip_radius.numpy().repeat(strips), strict=True):
+        axes.add_patch(Circle((x, z), radius, fc="C0", ec="C0", alpha=0.25))
+    contacts = sim.contacts
+    count = int(contacts.count.numpy()[0])
+    points, normals = (array.numpy()[0, :count] for array in (contacts.point, contacts.normal))
+    axes.quiver(*points[:, ::2].T, *normals[:, ::2].T, color="C3", scale=12, width=0.004, zorder=4)
+    heights = sim.bank.terrain.heights.numpy()[0]
+    shown = slice(round(5.6 / SPACING), round(7.4 / SPACING) + 1)
+    x = SPACING * np.arange(heights.shape[1])[shown]
+    for y in {round(float(point[1]) / SPACING) for point in points}:
+        axes.plot(x, heights[y, shown], color="0.3", lw=1)
+    axes.set(xlim=(x[0], x[-1]), aspect="equal", xlabel="x [m]", ylabel="z [m]")
+    return figure
+
+
+def draw_pack() -> Figure:
+    """Terrains of ANYmal's pack from above, forty of them."""
+    heights = read_pack(find_pack("anymal")).heights
+    figure = new_figure(12, 3.4)
+    for axes, grid in zip(figure.subplots(5, 8).flat, heights[:: max(1, len(heights) // 40)], strict=False):
+        axes.imshow(height_colors(grid), origin="lower")
+        axes.set_axis_off()
+    return figure
+
+
 def draw_loop() -> Figure:
     """A search as a loop: who hands what to whom."""
     figure = new_figure(9, 3.0)
@@ -213,7 +282,7 @@ def draw(name: str, figure: Figure, *made_of: str) -> None:
 
 def main() -> None:
     """Makes the pictures that the command line names, all without any."""
-    wanted = sys.argv[1:] or ["film", "conditions", "stills", "pages", "curves", "drawings"]
+    wanted = sys.argv[1:] or ["film", "conditions", "training", "stills", "pages", "curves", "drawings"]
     if "film" in wanted:
         pictures = [picture for about in CLIPS for picture in clip(*about)]
         save(PICTURES / "fault.gif", as_gif(pictures), "Film")
@@ -221,11 +290,15 @@ def main() -> None:
         note_picture("fault.gif", *made_of, *(f"results/{robot}/{name}.pt" for robot, *_, name in CLIPS if name))
     if "conditions" in wanted:
         film_conditions()
+    if "training" in wanted:
+        film_training()
     if "stills" in wanted and (course := course_source()) is not None:
         take_still(course, "course")
     if "drawings" in wanted:
         draw("elements.png", draw_elements())
         draw("loop.png", draw_loop())
+        draw("probes.png", draw_probes())
+        draw("pack.png", draw_pack(), f"{find_pack('anymal').relative_to(Path.cwd())}/pack.npz")
     if "curves" in wanted:
         draw("noise.png", draw_noise(), *(f"results/{robot}/search_noise.json" for robot in ROBOTS))
         curves = [f"results/{robot}/{name}/curve.json" for robot in ROBOTS for name in GROWN]
