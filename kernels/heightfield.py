@@ -137,6 +137,14 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
 
     Below the surface by more than ``reach`` the distance to the triangle straight above is returned instead.
     """
+    point = SurfacePoint()
+    point.normal = wp.vec3(0.0, 0.0, 1.0)
+    point.distance = _FAR
+    if reach > terrain.spacing:  # over so many cells that they have fewer ceilings
+        beside = wp.vec2(reach, reach)
+        middle = wp.vec2(p[0], p[1])
+        if p[2] - reach >= ceiling_over(terrain, t, middle - beside, middle + beside):
+            return point
     row0 = int(wp.floor((p[1] - reach) / terrain.spacing))
     row1 = int(wp.floor((p[1] + reach) / terrain.spacing))
     col0 = int(wp.floor((p[0] - reach) / terrain.spacing))
@@ -172,9 +180,6 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
                     if wp.length_sq(p - second) < least:
                         least = wp.length_sq(p - second)
                         nearest = second
-    point = SurfacePoint()
-    point.normal = wp.vec3(0.0, 0.0, 1.0)
-    point.distance = _FAR
     if not searched:
         return point
     distance = wp.length(p - nearest)

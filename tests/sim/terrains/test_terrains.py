@@ -82,10 +82,10 @@ def test_a_simulation_takes_genes_of_its_own_space_alone_wherever_its_code_lies(
 
 
 def block_maxima(heights):
-    """Highest node of each 8 x 8 cells, from its 9 x 9 nodes."""
+    """Highest node of each 4 x 4 cells, from its 5 x 5 nodes."""
     nrow, ncol = heights.shape[1:]
-    rows, cols = range(0, nrow - 1, 8), range(0, ncol - 1, 8)
-    return np.array([[[grid[r : r + 9, c : c + 9].max() for c in cols] for r in rows] for grid in heights])
+    rows, cols = range(0, nrow - 1, 4), range(0, ncol - 1, 4)
+    return np.array([[[grid[r : r + 5, c : c + 5].max() for c in cols] for r in rows] for grid in heights])
 
 
 def test_terrains_are_replaced_in_place(device):
