@@ -20,7 +20,7 @@ _NO_PROSE = (
     r"<!-- table:.*?<!-- end -->", r"<!--.*?-->", r"^```.*?^```$", r"`[^`\n]*`", r"\]\([^)\s]*\)", r"https?://\S+",
 )  # fmt: skip
 _LISTS = ("docs/controllers.md", "docs/reference.md", "docs/terrains.md")
-"""Pages whose tables say what files and genes hold: tests of their own compare what may change."""
+"""Pages whose tables say what files and genes hold; of these, elements and conditions are compared with the code."""
 _FUNCTIONS = {"__builtins__": {}, "len": len, "max": max, "min": min, "round": round, "sum": sum}
 """What an expression may call."""
 _KINDS = (

@@ -71,6 +71,11 @@ def test_the_elements_of_the_page_are_those_of_courses():
         # Whole numbers are of cells, or of steps and pallets. A turn is a direction, or a shift by so many cells.
         ends = [{end, SPACING * end} for about in kind.ranges for end in about[:2]]
         assert all(any(np.isclose(number, [*end]).any() for end in ends) for number in said), (name, said, ends)
+        for pair in re.findall(r"(?<![\d:.])(\d[\d.]*) to (\d[\d.]*)(?!:)", " ".join(words)):
+            pairs = [
+                (SPACING**cells * about.low, SPACING**cells * about.high) for about in kind.ranges for cells in (0, 1)
+            ]
+            assert any(np.allclose([*map(float, pair)], both) for both in pairs), (name, pair)
         for end in ends[:-2]:
             assert 0 in end or any(np.isclose(number, [*end]).any() for number in said), (name, said, end)
 

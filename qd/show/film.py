@@ -54,12 +54,17 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One episode of a recording of one terrain."""
+    """One episode of a recording of one terrain, and what of it is filmed."""
 
     recording: Recording
     episode: int
     title: str = ""
     beside: tuple[str, Recording] | None = None  # name of a ghost's controller, and its crossings from the same starts
+    whole: bool = False  # from the start to the end, not from ``before_s`` the robot fails to ``after_s`` [s]
+    before_s: float = 3.0
+    after_s: float = 1.0
+    slowness: float = 4.0  # of the second before the robot fails
+    fps: float = FPS
 
     @property
     def end(self) -> float:
@@ -79,25 +84,25 @@ class Shot:
             return None
         return replace(self, recording=self.beside[1], beside=None).end
 
-    def times(
-        self, fps: float, *, whole: bool = False, before_s: float = 3.0, after_s: float = 1.0, slowness: float = 4.0
-    ) -> NDArray[np.float64]:
+    @property
+    def stop(self) -> float:
+        """Until when the robot is shown; then a ghost that arrives later [s]."""
+        return (self.end if self.whole or self.moment is None else self.moment) + self.after_s
+
+    @property
+    def times(self) -> NDArray[np.float64]:
         """Time of each picture [s]: from before the robot fails to after it, the second before it slower.
 
         The whole of the episode, or one in which the robot arrives, is shown to ``after_s`` after its end. A ghost that
-        arrives later is shown to ``after_s`` after that, the rest of its way quickly.
+        arrives later than that is shown to ``after_s`` after its arrival, the rest of its way quickly.
         """
-        moment = self.end if self.moment is None else self.moment
-        whole = whole or self.moment is None
-        begin, stop = (0.0, self.end + after_s) if whole else (max(0.0, moment - before_s), moment + after_s)
+        moment, stop = self.end if self.moment is None else self.moment, self.stop
+        begin = 0.0 if self.whole or self.moment is None else max(0.0, moment - self.before_s)
         slow = moment if self.moment is None else max(begin, moment - _SLOW_S)
         arrival = max(stop, self.arrival or 0.0)
-        last_s = after_s if arrival > stop else 0.0
-        played = np.cumsum(
-            [0.0, slow - begin, slowness * (moment - slow), stop - moment, (arrival - stop) / _QUICKNESS, last_s]
-        )
-        ends = [begin, slow, moment, stop, arrival, arrival + last_s]
-        return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / fps), played, ends)
+        ends = np.array([begin, slow, moment, stop, arrival, arrival + self.after_s * (arrival > stop)])
+        played = np.append(0.0, np.cumsum(np.diff(ends) * [1.0, self.slowness, 1.0, 1.0 / _QUICKNESS, 1.0]))
+        return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / self.fps), played, ends)
 
 
 def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
@@ -113,12 +118,13 @@ def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.fl
 def follow(shot: Shot, times: NDArray[np.float64], distance: float) -> list[Camera]:
     """A camera a time, ``distance`` [m] from the base: it follows smoothly, as low as the ground never hides it.
 
-    Behind the end of the episode it follows a ghost that arrives later.
+    Once the robot has been shown it follows a ghost that arrives later.
     """
     recording = shot.recording
     base = recording.qpos(0, shot.episode)[:, :3]
-    if shot.beside is not None and (shot.arrival or 0.0) > shot.end:
-        base = np.concatenate([base, shot.beside[1].qpos(0, shot.episode)[len(base) :, :3]])
+    if shot.beside is not None and (shot.arrival or 0.0) > shot.stop:
+        shown = np.minimum(np.arange(round(shot.stop / recording.dt)), len(base) - 1)
+        base = np.concatenate([base[shown], shot.beside[1].qpos(0, shot.episode)[len(shown) :, :3]])
     smooth = uniform_filter1d(base, max(1, round(_SMOOTH_S / recording.dt)) | 1, axis=0, mode="nearest")
     targets = np.stack([np.interp(times, recording.dt * np.arange(len(base)), axis) for axis in smooth.T], axis=1)
     elevation = clear_elevation(recording.heights[0], targets, distance)
@@ -163,7 +169,7 @@ def render_pictures(
         draw.line(_locate(chart, path), get_ending(recording, k).color if shown else "white", 1 + 2 * shown)
     if goal := places(asked_of(recording.ground)).get("goal"):
         draw.circle(_locate(chart, np.array([goal]))[0], side / 60, "#009e73", "white")
-    speeds = (np.diff(times, append=np.inf) * (FPS if size[0] > GIF_SIZE[0] else GIF_FPS)).tolist()
+    speeds = (np.diff(times, append=np.inf) * shot.fps).tolist()
     width, height = (pixels * (1 if size[0] > GIF_SIZE[0] else _SUPERSAMPLING) for pixels in size)
     look: Any = {"width": width, "height": height, "shadows": shadows, "ground": recording.ground}
     with Renderer(robot, recording.heights[0], **look) as renderer:
@@ -228,8 +234,8 @@ def film(
     """Films the seconds around the failure, or the ``whole``, as the MP4 or GIF that ``out`` is by its name."""
     gif = out.suffix == ".gif"
     size = GIF_SIZE if gif else _SIZE
-    times = shot.times(GIF_FPS if gif else FPS, whole=whole)
-    pictures = render_pictures(shot, robot, times, size, shadows=shadows, progress=progress)
+    shot = replace(shot, whole=whole, fps=GIF_FPS if gif else FPS)
+    pictures = render_pictures(shot, robot, shot.times, size, shadows=shadows, progress=progress)
     if gif:
         save(out, as_gif([*pictures]), "Film")
         return

@@ -694,6 +694,9 @@ def with_tables(text: str) -> str:
 def note_picture(name: str, *sources: str) -> None:
     """Keeps of which files a picture of docs/pictures was made just now."""
     made = read(MADE) | {name: {source: _hash(source) for source in sources}}
+    if missing := [source for source, known in made[name].items() if not known]:
+        raise FileNotFoundError(f"{name} is made of {', '.join(missing)}, which is not there")
+    made = {name: known for name, known in made.items() if (ROOT / MADE).with_name(name).exists()}
     (ROOT / MADE).write_text(json.dumps(dict(sorted(made.items())), indent=1) + "\n", encoding="utf-8")
 
 
@@ -706,12 +709,15 @@ def find_old_pictures() -> dict[str, str]:
 
 
 def _hash(source: str) -> str:
+    """SHA-256 of a file, or of a part of one; empty if there is none."""
     file, _, keys = source.partition("#")
     if not keys:
-        return hashlib.sha256((ROOT / file).read_bytes()).hexdigest()
+        return hashlib.sha256((ROOT / file).read_bytes()).hexdigest() if (ROOT / file).exists() else ""
     part = read(file)
     for key in keys.split("/"):
-        part = part.get(key, {})
+        part = part.get(key)
+        if part is None:
+            return ""
     return hashlib.sha256(json.dumps(part, sort_keys=True).encode()).hexdigest()
 
 

@@ -78,8 +78,9 @@ def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]
     (recording,) = source.record("cpu")
     other = (beside, source.record("cpu", source.requests(controllers_in(robot.panel)[beside]))[0]) if beside else None
     episode, title = find_typical_episode(recording, source.scales), make_title(replace(recording, labels=(words,)))
-    shot = Shot(recording=recording, episode=episode, title=title, beside=other)
-    return [*render_pictures(shot, robot, shot.times(GIF_FPS, before_s=2.5, after_s=0.5, slowness=2.0))]
+    cut: Any = {"before_s": 2.5, "after_s": 0.5, "slowness": 2.0, "fps": GIF_FPS}
+    shot = Shot(recording=recording, episode=episode, title=title, beside=other, **cut)
+    return [*render_pictures(shot, robot, shot.times)]
 
 
 def take_still(source: ReplaySource, name: str) -> None:
@@ -100,8 +101,9 @@ def film_failure(source: ReplaySource, name: str, words: str, *made_of: str) -> 
     if not stopped:
         return
     episode = find_typical_episode(recording, source.scales, int(typical_outcome(np.array(stopped))))
-    shot = Shot(recording=recording, episode=episode, title=make_title(replace(recording, labels=(words,))))
-    pictures = render_pictures(shot, source.robot, shot.times(GIF_FPS, before_s=1.5, after_s=0.5), FILM_SIZE)
+    title = make_title(replace(recording, labels=(words,)))
+    shot = Shot(recording=recording, episode=episode, title=title, before_s=1.5, after_s=0.5, fps=GIF_FPS)
+    pictures = render_pictures(shot, source.robot, shot.times, FILM_SIZE)
     save(PICTURES / f"{name}.gif", as_gif([*pictures], FILM_BYTES), "Film")
     note_picture(f"{name}.gif", *made_of)
 
@@ -125,9 +127,10 @@ def film_training() -> None:
         rates = [count_rates(recording)["goal_rate"] for recording in (before, after)]
         episode = find_typical_episode(before, source.scales)
         if rates[0].hits == 0 and rates[1].hits == rates[1].count:
-            shot = Shot(recording=before, episode=episode, title=make_title(before), beside=("hardened", after))
-            times = shot.times(GIF_FPS, before_s=1.5, after_s=0.5, slowness=2.0)
-            save(PICTURES / "hardened.gif", as_gif([*render_pictures(shot, opened.robot, times)], 1_000_000), "Film")
+            cut: Any = {"before_s": 1.5, "after_s": 0.5, "slowness": 2.0, "fps": GIF_FPS}
+            shot = Shot(recording=before, episode=episode, title=make_title(before), beside=("hardened", after), **cut)
+            pictures = render_pictures(shot, opened.robot, shot.times)
+            save(PICTURES / "hardened.gif", as_gif([*pictures], 1_000_000), "Film")
             note_picture("hardened.gif", f"{run}/archive.npz", hardened, "sim/robots/anymal.pt")
             return
 
@@ -297,7 +300,7 @@ def main() -> None:
     if "drawings" in wanted:
         draw("elements.png", draw_elements())
         draw("loop.png", draw_loop())
-        draw("probes.png", draw_probes())
+        draw("probes.png", draw_probes(), "sim/robots/anymal.xml", "sim/robots/anymal.pt")
         draw("pack.png", draw_pack(), f"{find_pack('anymal').relative_to(Path.cwd())}/pack.npz")
     if "curves" in wanted:
         draw("noise.png", draw_noise(), *(f"results/{robot}/search_noise.json" for robot in ROBOTS))

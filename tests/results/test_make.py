@@ -274,9 +274,12 @@ def test_a_picture_is_old_once_what_it_shows_is_another(tmp_path, monkeypatch):
     assert "a.gif" not in docs.find_old_pictures()
     numbers.write_text('{"dogs": {"a": 4, "b": 3}}')
     assert docs.find_old_pictures()["a.gif"] == "numbers.json#dogs/a"
-    archive.write_bytes(b"others")
-    docs.note_picture("a.gif", "numbers.json#dogs/a")
-    assert "a.gif" not in docs.find_old_pictures()
+    docs.note_picture("a.gif", "archive.npz")
+    archive.unlink()
+    assert docs.find_old_pictures()["a.gif"] == "archive.npz"
+    for absent in ("archive.npz", "numbers.json#dogs/c"):
+        with pytest.raises(FileNotFoundError, match=absent):
+            docs.note_picture("a.gif", absent)
 
 
 def test_a_table_is_written_between_its_marks(tmp_path, monkeypatch):

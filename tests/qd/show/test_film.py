@@ -77,24 +77,42 @@ def test_the_title_names_the_commonest_ending(recording):
 
 def test_a_film_begins_three_seconds_before_the_failure_slows_down_and_ends_one_after(recording):
     # Of an end at 5 s: 2 to 4 s, then 4 to 5 s in 4 s, then 1 s in which the last frame is held.
-    times = Shot(recording=recording, episode=4).times(10)
+    times = Shot(recording=recording, episode=4, fps=10).times
     np.testing.assert_allclose(times[[0, 20, 40, 60, 70]], [2.0, 4.0, 4.5, 5.0, 6.0])
     assert len(times) == 71
-    whole = Shot(recording=recording, episode=4).times(10, whole=True)
+    whole = Shot(recording=recording, episode=4, whole=True, fps=10).times
     np.testing.assert_allclose(whole[[0, 40, 60, 80, 90]], [0.0, 4.0, 4.5, 5.0, 6.0])
-    arrives = Shot(recording=recording, episode=1).times(10)
+    arrives = Shot(recording=recording, episode=1, fps=10).times
     np.testing.assert_allclose(arrives, np.arange(61) / 10)  # all of it, at its speed
     short = replace(recording, num_frames=np.full((1, 5), 26, np.int32))
-    np.testing.assert_allclose(Shot(recording=short, episode=4).times(10)[[0, 20, 30]], [0.0, 0.5, 1.5])
+    np.testing.assert_allclose(Shot(recording=short, episode=4, fps=10).times[[0, 20, 30]], [0.0, 0.5, 1.5])
     # A ghost that arrives at 5 s, after a failure at 0.5 s: from 1.5 s on in 0.875 s, and 1 s more.
     beside = "C-G", replace(recording, outcome=np.full((1, 5), Outcome.GOAL, np.uint8))
-    shot = Shot(recording=short, episode=4, beside=beside)
+    shot = Shot(recording=short, episode=4, beside=beside, fps=8)
     assert shot.arrival == pytest.approx(5.0)
-    np.testing.assert_allclose(shot.times(8)[[0, 16, 24, 31, 39]], [0.0, 0.5, 1.5, 5.0, 6.0])
-    stuck = "C-G", recording
-    assert Shot(recording=short, episode=4, beside=stuck).times(8)[-1] == pytest.approx(1.5)
-    later = [camera.target[0] for camera in follow(shot, np.array([0.4, 5.0]), 3.0)]
-    np.testing.assert_allclose(later[1] - later[0], np.ptp(recording.qpos(0, 4)[[20, 250], 0]), rtol=0.1)
+    np.testing.assert_allclose(shot.times[[0, 16, 24, 31, 39]], [0.0, 0.5, 1.5, 5.0, 6.0])
+    assert replace(shot, beside=("C-G", recording)).times[-1] == pytest.approx(1.5)  # it gets stuck
+
+
+def test_the_camera_turns_to_a_ghost_that_arrives_once_the_failure_was_shown(recording):
+    ahead = replace(
+        recording, outcome=np.full((1, 5), Outcome.GOAL, np.uint8), base_position=recording.base_position + 3
+    )
+    for failed in (
+        replace(recording, num_frames=np.full((1, 5), 26, np.int32)),  # its episode ends with the fall
+        replace(
+            recording, num_frames=np.full((1, 5), 151, np.int32), base_position=0 * recording.base_position
+        ),  # stuck
+    ):
+        alone = Shot(recording=failed, episode=4)
+        beside = replace(alone, beside=("C-G", ahead))
+        assert alone.moment is not None and beside.arrival is not None and beside.stop == alone.moment + 1.0
+        times = np.array([alone.moment, beside.stop - 0.5, beside.stop + 0.5, beside.arrival])
+        xs, ghost = (
+            [c.target[0] for c in follow(shot, times, 3.0)] for shot in (beside, Shot(recording=ahead, episode=4))
+        )
+        np.testing.assert_allclose(xs[:2], [camera.target[0] for camera in follow(alone, times[:2], 3.0)], atol=0.1)
+        np.testing.assert_allclose(xs[2:], ghost[2:], atol=0.02)
 
 
 def test_poses_lie_between_those_recorded():
