@@ -151,7 +151,6 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
     col1 = int(wp.floor((p[0] + reach) / terrain.spacing))
     nearest = wp.vec3(p[0], p[1], p[2] + _FAR)
     least = float(_FAR)  # squared distance
-    searched = bool(False)
     for row in range(row0, row1 + 1):
         y = float(row) * terrain.spacing
         across = wp.max(wp.max(y - p[1], p[1] - y - terrain.spacing), 0.0)
@@ -164,7 +163,6 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
             h11 = node_height(terrain, t, row + 1, col + 1)
             above = p[2] - wp.max(wp.max(h00, h10), wp.max(h01, h11))
             if above < reach:
-                searched = True
                 x = float(col) * terrain.spacing
                 along = wp.max(wp.max(x - p[0], p[0] - x - terrain.spacing), 0.0)
                 above = wp.max(above, 0.0)
@@ -180,7 +178,7 @@ def nearest_surface_point(terrain: Terrain, t: int, p: wp.vec3, reach: float) ->
                     if wp.length_sq(p - second) < least:
                         least = wp.length_sq(p - second)
                         nearest = second
-    if not searched:
+    if least == _FAR:
         return point
     distance = wp.length(p - nearest)
     point.distance = distance

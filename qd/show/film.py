@@ -69,7 +69,7 @@ class Shot:
     @property
     def end(self) -> float:
         """When the episode ends [s]."""
-        return self.recording.dt * (int(self.recording.num_frames[0, self.episode]) - 1)
+        return _find_end(self.recording, self.episode)
 
     @property
     def moment(self) -> float | None:
@@ -82,7 +82,7 @@ class Shot:
         """When the ghost arrives, if there is one that does [s]."""
         if self.beside is None or self.beside[1].outcome[0, self.episode] != Outcome.GOAL:
             return None
-        return replace(self, recording=self.beside[1], beside=None).end
+        return _find_end(self.beside[1], self.episode)
 
     @property
     def stop(self) -> float:
@@ -103,6 +103,10 @@ class Shot:
         ends = np.array([begin, slow, moment, stop, arrival, arrival + self.after_s * (arrival > stop)])
         played = np.append(0.0, np.cumsum(np.diff(ends) * [1.0, self.slowness, 1.0, 1.0 / _QUICKNESS, 1.0]))
         return np.interp(np.arange(0.0, played[-1] + 1e-9, 1.0 / self.fps), played, ends)
+
+
+def _find_end(recording: Recording, episode: int) -> float:
+    return recording.dt * (int(recording.num_frames[0, episode]) - 1)
 
 
 def interpolate_pose(poses: NDArray[np.floating], frame: float) -> NDArray[np.floating]:
@@ -227,14 +231,13 @@ def film(
     robot: RobotCfg,
     *,
     out: Path,
-    whole: bool = False,
     shadows: bool = True,
     progress: Progress | None = None,
 ) -> None:
-    """Films the seconds around the failure, or the ``whole``, as the MP4 or GIF that ``out`` is by its name."""
+    """Films a shot as the MP4 or GIF that ``out`` is by its name."""
     gif = out.suffix == ".gif"
     size = GIF_SIZE if gif else _SIZE
-    shot = replace(shot, whole=whole, fps=GIF_FPS if gif else FPS)
+    shot = replace(shot, fps=GIF_FPS if gif else FPS)
     pictures = render_pictures(shot, robot, shot.times, size, shadows=shadows, progress=progress)
     if gif:
         save(out, as_gif([*pictures]), "Film")
@@ -271,12 +274,13 @@ def film_source(
     beside: str | None = None,
     device: str = "cpu",
     out: Path | None = None,
-    **look: Any,
+    whole: bool = False,
+    shadows: bool = True,
 ) -> list[Path]:
     """Films of terrains; all is crossed and stored before the first is made.
 
     ``beside`` names a ghost: a certifier, one of the panel, a file, or ``witness``, which is steered on the elite.
-    ``look`` may have ``whole`` and ``shadows`` of :func:`film`.
+    The ``whole`` of an episode is shown, or the seconds around its failure.
     """
     if not gif and out is not None and out.suffix == ".gif":
         raise ValueError(f"{out} is a GIF by its name: give --gif too")
@@ -292,9 +296,10 @@ def film_source(
     for recording, ghost, file in itertools.zip_longest(recordings, ghosts, files):
         other = None if beside is None else (beside if beside == WITNESS else label_suffix(beside)[1:], ghost)
         number = find_typical_episode(recording, source.scales) if episode is None else episode
-        shot = Shot(recording=recording, episode=number, title=make_title(recording, source.by), beside=other)
+        title = make_title(recording, source.by)
+        shot = Shot(recording=recording, episode=number, title=title, beside=other, whole=whole)
         with Bar(f"filming {recording.labels[0]}") as bar:
-            film(shot, source.robot, out=file, progress=bar.move_to, **look)
+            film(shot, source.robot, out=file, shadows=shadows, progress=bar.move_to)
     return files
 
 

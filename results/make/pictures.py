@@ -69,6 +69,8 @@ GROWN = {
 """Published searches whose growth is drawn, with label and colour."""
 FILM_SIZE, FILM_BYTES = (400, 225), 300_000
 """Width and height of a small film [pixels], and its largest file."""
+SHORT: dict[str, Any] = {"before_s": 1.5, "after_s": 0.5, "fps": GIF_FPS}
+"""What a film on a page shows about a failure."""
 
 
 def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]:
@@ -78,8 +80,8 @@ def clip(named: str, file: str, words: str, beside: str | None) -> list[Picture]
     (recording,) = source.record("cpu")
     other = (beside, source.record("cpu", source.requests(controllers_in(robot.panel)[beside]))[0]) if beside else None
     episode, title = find_typical_episode(recording, source.scales), make_title(replace(recording, labels=(words,)))
-    cut: Any = {"before_s": 2.5, "after_s": 0.5, "slowness": 2.0, "fps": GIF_FPS}
-    shot = Shot(recording=recording, episode=episode, title=title, beside=other, **cut)
+    longer: Any = SHORT | {"before_s": 2.5, "slowness": 2.0}
+    shot = Shot(recording=recording, episode=episode, title=title, beside=other, **longer)
     return [*render_pictures(shot, robot, shot.times)]
 
 
@@ -102,7 +104,7 @@ def film_failure(source: ReplaySource, name: str, words: str, *made_of: str) -> 
         return
     episode = find_typical_episode(recording, source.scales, int(typical_outcome(np.array(stopped))))
     title = make_title(replace(recording, labels=(words,)))
-    shot = Shot(recording=recording, episode=episode, title=title, before_s=1.5, after_s=0.5, fps=GIF_FPS)
+    shot = Shot(recording=recording, episode=episode, title=title, **SHORT)
     pictures = render_pictures(shot, source.robot, shot.times, FILM_SIZE)
     save(PICTURES / f"{name}.gif", as_gif([*pictures], FILM_BYTES), "Film")
     note_picture(f"{name}.gif", *made_of)
@@ -125,10 +127,9 @@ def film_training() -> None:
         source = source_from_run(opened, str(number))
         (before,), (after,) = source.record("cpu"), source.record("cpu", source.requests(hardened))
         rates = [count_rates(recording)["goal_rate"] for recording in (before, after)]
-        episode = find_typical_episode(before, source.scales)
         if rates[0].hits == 0 and rates[1].hits == rates[1].count:
-            cut: Any = {"before_s": 1.5, "after_s": 0.5, "slowness": 2.0, "fps": GIF_FPS}
-            shot = Shot(recording=before, episode=episode, title=make_title(before), beside=("hardened", after), **cut)
+            what: Any = {"episode": find_typical_episode(before, source.scales), "title": make_title(before)}
+            shot = Shot(recording=before, beside=("hardened", after), slowness=2.0, **what, **SHORT)
             pictures = render_pictures(shot, opened.robot, shot.times)
             save(PICTURES / "hardened.gif", as_gif([*pictures], 1_000_000), "Film")
             note_picture("hardened.gif", f"{run}/archive.npz", hardened, "sim/robots/anymal.pt")

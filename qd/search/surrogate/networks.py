@@ -66,13 +66,11 @@ class Networks(nn.Module):
 
     def _through(self, maps: Tensor, layers: _Layers) -> Tensor:
         """Outputs of some networks for maps of each or of all, shape (batch, networks, num_out)."""
-        (first_weight, first_bias), *further = layers
-        (size, strides, _), *convolutions = _CONVOLUTIONS
+        rows, convolutions = maps.movedim(-1, 1), [*zip(_CONVOLUTIONS, layers, strict=False)]
         if maps.is_cuda:
-            rows = _slide_over(maps.movedim(-1, 1), first_weight.to(maps.dtype), first_bias.to(maps.dtype), strides)
-        else:
-            rows = _activated(maps.movedim(-1, 1), first_weight[0], first_bias[0], strides, size // 2)
-        for (size, strides, _), (weight, bias) in zip(convolutions, further, strict=False):
+            (_, strides, _), (weight, bias) = convolutions.pop(0)
+            rows = _slide_over(rows, weight.to(rows.dtype), bias.to(rows.dtype), strides)
+        for (size, strides, _), (weight, bias) in convolutions:
             weight = _block_diagonal(weight).to(rows.dtype)
             rows = _activated(rows, weight, bias.flatten().to(rows.dtype), strides, size // 2)
         (weight, bias), (last_weight, last_bias) = layers[-2:]

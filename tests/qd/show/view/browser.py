@@ -105,7 +105,8 @@ def take(page, file: Path) -> None:
 
 def main() -> None:
     """Takes all pictures."""
-    run, shown = "results/anymal/archive", "results/anymal/archive/archive.npz"
+    run = "results/anymal/archive"
+    shown = f"{run}/archive.npz"
     report = ROOT / "runs/pictures/report.html"
     command = [sys.executable, "-m", "faultline", "report", "--run", run, "--out", str(report)]
     subprocess.run(command, cwd=ROOT, check=True)
